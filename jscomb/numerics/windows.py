@@ -1,0 +1,286 @@
+"""Sums, means and extrema over square windows that are clipped to the image.
+
+The window of pixel c is the w-by-w square about c, cut off at the border: never
+reflected, never wrapped, because a reflected pixel is not a new sample. So the count
+p_c of its pixels varies, and any image of at least 1x1 works, also one smaller than the
+window.
+
+Everything is separable and made of additions of the window's own pixels. Running
+differences (integral images) are never used: one firefly of 1e6 would erase the float32
+digits of every later pixel in its row. Columns are slid by doubling (sums over 1, 2, 4,
+... pixels, put together by the bits of w), the fastest form on a CPU; rows by
+`lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
+(two collective permutes, where doubling needs twelve). Gaussian and given weights have
+no such form: sharded by rows they exchange pixels once for every row of the window.
+
+A `mask` names the pixels that take part; what the others hold is never looked at, so it
+may be NaN.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jscomb.numerics.guards import divide
+from jscomb.typing import Image, Mask
+
+
+def window_sum(image: Image, window: int, *, mask: Mask | None = None) -> Image:
+    """Sum over the window of each pixel.
+
+    Args:
+        image: values of any unit, shape [H,W,C].
+        window: width w of the window in pixels, odd.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+
+    Returns:
+        the sums, in the unit of `image`, shape [H,W,C].
+
+    Raises:
+        ValueError: if `window` is even or less than one.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> print(window_sum(jnp.ones((2, 3, 1)), 3)[..., 0])
+        [[4. 6. 4.]
+         [4. 6. 4.]]
+    """
+    return _slide(_only(image, mask, 0.0), window, lax.add, 0.0)
+
+
+def window_mean(
+    image: Image, window: int, *, mask: Mask | None = None, sigma: float | None = None
+) -> Image:
+    """Mean over the window of each pixel, equal or Gaussian weights.
+
+    Args:
+        image: values of any unit, shape [H,W,C].
+        window: width w of the window in pixels, odd.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+        sigma: standard deviation in pixels of Gaussian weights; None for equal ones.
+
+    Returns:
+        the means, in the unit of `image`, shape [H,W,C]; 0 where no pixel of the
+        window takes part.
+
+    Raises:
+        ValueError: if `window` is even or less than one, or `sigma` is not positive.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> print(window_mean(jnp.arange(3.0).reshape(1, 3, 1), 3)[..., 0])
+        [[0.5 1.  1.5]]
+    """
+    image, ones = _only(image, mask, 0.0), _ones(image, mask)
+    if sigma is None:
+        total, weight = window_sum(image, window), window_sum(ones, window)
+    else:
+        total, weight = (_gaussian_sum(i, window, sigma) for i in (image, ones))
+    weight = jnp.broadcast_to(weight, total.shape)
+    return divide(total, weight, where=weight > 0)
+
+
+def window_min(image: Image, window: int, *, mask: Mask | None = None) -> Image:
+    """Least value in the window of each pixel.
+
+    Args:
+        image: values of any unit, shape [H,W,C].
+        window: width w of the window in pixels, odd.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+
+    Returns:
+        the minima, shape [H,W,C]; infinite where no pixel of the window takes part.
+
+    Raises:
+        ValueError: if `window` is even or less than one.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> print(window_min(jnp.arange(4.0).reshape(1, 4, 1), 3)[..., 0])
+        [[0. 0. 1. 2.]]
+    """
+    return _slide(_only(image, mask, np.inf), window, lax.min, np.inf)
+
+
+def window_max(image: Image, window: int, *, mask: Mask | None = None) -> Image:
+    """Greatest value in the window of each pixel.
+
+    Args:
+        image: values of any unit, shape [H,W,C].
+        window: width w of the window in pixels, odd.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+
+    Returns:
+        the maxima, shape [H,W,C]; minus infinity where no pixel of the window takes
+        part.
+
+    Raises:
+        ValueError: if `window` is even or less than one.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> print(window_max(jnp.arange(4.0).reshape(1, 4, 1), 3)[..., 0])
+        [[1. 2. 3. 3.]]
+    """
+    return _slide(_only(image, mask, -np.inf), window, lax.max, -np.inf)
+
+
+def window_count(
+    shape: tuple[int, ...], window: int, *, dtype: jnp.dtype | type = jnp.float32
+) -> Float[Array, "h w 1"]:
+    """Number p_c of pixels in the clipped window of each pixel; costs no sum.
+
+    Args:
+        shape: of the image, at least (H, W).
+        window: width w of the window in pixels, odd.
+        dtype: of the result.
+
+    Returns:
+        the counts, shape [H,W,1].
+
+    Raises:
+        ValueError: if `window` is even or less than one.
+
+    Example:
+        >>> print(window_count((2, 3), 3)[..., 0])
+        [[4. 6. 4.]
+         [4. 6. 4.]]
+    """
+    r = check_window(window) // 2
+
+    def along(n: int) -> np.ndarray:
+        at = np.arange(n)
+        return np.minimum(at + r, n - 1) - np.maximum(at - r, 0) + 1
+
+    return jnp.asarray(np.outer(along(shape[0]), along(shape[1]))[..., None], dtype)
+
+
+def weighted_mean(
+    image: Image,
+    weights: Float[Array, "h w window2"],
+    window: int,
+    *,
+    mask: Mask | None = None,
+) -> Image:
+    """Mean over the window of each pixel with weights of its own.
+
+    Row by row of the window, so that neither the value nor the reverse derivative ever
+    holds the w² shifted copies of the image.
+
+    Args:
+        image: values of any unit, shape [H,W,C].
+        weights: at least zero, shape [H,W,w²], row-major over the offsets
+            (-r, -r) ... (r, r); those that fall outside the image do not count.
+        window: width w of the window in pixels, odd.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+
+    Returns:
+        the means, in the unit of `image`, shape [H,W,C]; 0 where the weights of all
+        pixels that take part are 0.
+
+    Raises:
+        ValueError: if `window` is even or less than one, or the weights' shape is not
+            [H,W,w²].
+    """
+    h, w, c = image.shape
+    r = check_window(window) // 2
+    if weights.shape != (h, w, window**2):
+        raise ValueError(
+            f"weights must have shape {(h, w, window**2)} for this image and window, "
+            f"got {weights.shape}"
+        )
+    both = jnp.concatenate([_only(image, mask, 0.0), _ones(image, mask)], axis=-1)
+    padded = jnp.pad(both, ((r, r), (r, r), (0, 0)))
+
+    @jax.checkpoint
+    def add_row(total: Image, row: Array) -> tuple[Image, None]:
+        strip = lax.dynamic_slice_in_dim(padded, row, h, axis=0)
+        share = lax.dynamic_slice_in_dim(weights, row * window, window, axis=2)
+        for column in range(window):
+            near = lax.slice_in_dim(strip, column, column + w, axis=1)
+            total = total + share[..., column : column + 1] * near
+        return total, None
+
+    total, _ = lax.scan(add_row, jnp.zeros_like(both), jnp.arange(window))
+    weight = jnp.broadcast_to(total[..., c:], image.shape)
+    return divide(total[..., :c], weight, where=weight > 0)
+
+
+def check_window(window: int) -> int:
+    """The window if it is odd and positive.
+
+    Args:
+        window: width in pixels.
+
+    Returns:
+        the same width.
+
+    Raises:
+        ValueError: otherwise; raised while tracing.
+    """
+    if window < 1 or window % 2 == 0:
+        raise ValueError(f"window must be odd and positive, got {window}")
+    return window
+
+
+def _only(image: Image, mask: Mask | None, neutral: float) -> Image:
+    """The image with `neutral` where a pixel takes no part."""
+    return image if mask is None else jnp.where(mask, image, neutral)
+
+
+def _ones(image: Image, mask: Mask | None) -> Float[Array, "h w 1"]:
+    """One for each pixel that takes part."""
+    ones = jnp.ones_like(image[..., :1])
+    return ones if mask is None else mask.astype(image.dtype)
+
+
+def _slide(image: Image, window: int, operation: Callable, neutral: float) -> Image:
+    """Fold an associative operation over the window: columns, then rows."""
+    check_window(window)
+    columns = _fold_columns(image, window, operation, neutral)
+    # A concrete initial value, else jit loses the reverse derivative.
+    start = np.asarray(neutral, image.dtype)
+    return lax.reduce_window(
+        columns, start, operation, (window, 1, 1), (1, 1, 1), "SAME"
+    )
+
+
+def _fold_columns(
+    image: Image, window: int, operation: Callable, neutral: float
+) -> Image:
+    """Fold over the w columns about each pixel by doubling."""
+    r, width = window // 2, image.shape[1]
+    span, run = 1, jnp.pad(image, ((0, 0), (r, r), (0, 0)), constant_values=neutral)
+    folded, start = None, 0  # over columns [0, start) from the window's left edge
+    while span <= window:
+        if window & span:
+            part = run[:, start : start + width]
+            folded = part if folded is None else operation(folded, part)
+            start += span
+        if 2 * span <= window:
+            run = operation(run[:, :-span], run[:, span:])
+        span *= 2
+    assert folded is not None
+    return folded
+
+
+def _gaussian_sum(image: Image, window: int, sigma: float) -> Image:
+    """Sum over the window with Gaussian weights of total one where none is clipped."""
+    r = check_window(window) // 2
+    if not sigma > 0:
+        raise ValueError(f"sigma must be positive, got {sigma}")
+    weights = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
+    weights = (weights / weights.sum()).astype(image.dtype)
+    for axis in (1, 0):
+        size = image.shape[axis]
+        ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
+        padded = jnp.pad(image, ends)
+        image = sum(
+            weight * lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k, weight in enumerate(weights)
+        )  # type: ignore[assignment]
+    return image
