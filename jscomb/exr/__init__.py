@@ -1,0 +1,162 @@
+"""EXR in and out: what renderers write, as a `Frame`, and back.
+
+`read_frame` recognises who wrote a file (or directory) and maps it to the conventions
+of the toolkit: linear RGB, variance of the mean, an explicit sample count, pixels
+without data not finite. `write_frame` writes jscomb's own multi-part file, which holds
+all of a frame bit by bit.
+
+Every error is an `OSError` or a `ValueError` of one line that names the file and says
+what is wrong with it. Writing is atomic: a file that was there is replaced only by a
+whole one.
+"""
+
+import json
+import os
+from typing import Any
+
+import numpy as np
+from jax import Array
+from jaxtyping import ArrayLike
+
+from jscomb.exr import own
+from jscomb.exr.dialects import DIALECTS, recognise
+from jscomb.exr.files import Part, read_parts, write_parts
+from jscomb.frame import Frame, make_frame
+
+
+def read_frame(
+    path: str | os.PathLike,
+    *,
+    samples: int | None = None,
+    dialect: str | None = None,
+    statistics: bool = True,
+) -> Frame:
+    """Read what a renderer wrote.
+
+    Args:
+        path: an EXR file, or the directory of a Tungsten frame.
+        samples: samples a pixel, for files that do not say (Mitsuba); overrides what a
+            file says. Where a file holds statistics of single samples, the variance of
+            the mean depends on it.
+        dialect: a key of `dialects.DIALECTS`; recognised from the contents if None.
+        statistics: read variances; without them a sample count is never needed.
+
+    Returns:
+        the frame, in float32.
+
+    Raises:
+        FileNotFoundError: if there is nothing at `path`.
+        ValueError: if the file is not a whole EXR file, or lacks channels, or its
+            sample count is needed and not known; names the file and what is missing.
+    """
+    path = os.fspath(path)
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"{path}: no such file or directory")
+    if samples is not None and samples < 1:
+        raise ValueError(f"{path}: samples must be at least 1, got {samples}")
+    name = dialect
+    try:
+        name = name or recognise(path)
+        if name not in DIALECTS:
+            known = ", ".join(DIALECTS)
+            raise ValueError(f"unknown dialect {name!r}, expected one of {known}")
+        contents = DIALECTS[name](path, samples, statistics)
+        return contents if isinstance(contents, Frame) else make_frame(**contents)
+    except _MALFORMED as error:
+        if path in str(error):
+            raise ValueError(str(error)) from None
+        raise ValueError(f"{path}: read as {name}: {error}") from None
+
+
+# What attributes and channels of unexpected types, sizes or encodings lead to.
+_MALFORMED = (ValueError, TypeError, AttributeError, KeyError, IndexError)
+
+
+def read_image(path: str | os.PathLike) -> Array:
+    """Read only the colour of an EXR file of any dialect.
+
+    Args:
+        path: an EXR file, or the directory of a Tungsten frame.
+
+    Returns:
+        the full image, linear radiance, shape [H,W,C].
+
+    Raises:
+        FileNotFoundError: if there is nothing at `path`.
+        ValueError: if the file is not a whole EXR file with colour.
+    """
+    return read_frame(path, statistics=False).color
+
+
+def write_frame(
+    path: str | os.PathLike,
+    frame: Frame,
+    *,
+    provenance: dict[str, Any] | None = None,
+    half: tuple[str, ...] = (),
+) -> None:
+    """Write a frame as jscomb's own EXR file; `read_frame` gives it back bit by bit.
+
+    Args:
+        path: the file; replaced atomically if it exists.
+        frame: of any number of sub-buffers up to 26, float32.
+        provenance: where it came from; anything that JSON can hold.
+        half: buffers to store in 16 bits: names of `Buffers` fields, `biased`,
+            `biased_halves`, `half_difference`. Lossy (three digits, and below 6e-8
+            nothing); half the size.
+
+    Returns:
+        nothing.
+
+    Raises:
+        OSError: if the file cannot be written; nothing at `path` has changed.
+        ValueError: if a biased image has the name of another part (a letter of a
+            sub-buffer, `reference`, anything with a dot), or a value is too large for
+            16 bits.
+    """
+    write_parts(os.fspath(path), own.to_parts(frame, provenance or {}, half))
+
+
+def write_image(
+    path: str | os.PathLike,
+    image: ArrayLike,
+    *,
+    provenance: dict[str, Any] | None = None,
+) -> None:
+    """Write one RGB image that every viewer reads.
+
+    Args:
+        path: the file; replaced atomically if it exists.
+        image: linear radiance, shape [H,W,3].
+        provenance: where it came from; anything that JSON can hold.
+
+    Returns:
+        nothing.
+
+    Raises:
+        OSError: if the file cannot be written; nothing at `path` has changed.
+        ValueError: if the shape is not [H,W,3].
+    """
+    array = np.asarray(image, np.float32)
+    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+        raise ValueError(f"image must have shape [H,W,3], got {array.shape}")
+    channels = {name: array[..., c] for c, name in enumerate("RGB")}
+    attributes = {own.PROVENANCE: json.dumps(provenance or {}, default=str)}
+    write_parts(os.fspath(path), [Part("", channels, attributes)])
+
+
+def read_provenance(path: str | os.PathLike) -> dict[str, Any]:
+    """Where a file that jscomb wrote came from.
+
+    Args:
+        path: an EXR file.
+
+    Returns:
+        what `write_frame` or `write_image` was given; empty for another writer.
+
+    Raises:
+        FileNotFoundError: if there is nothing at `path`.
+        ValueError: if it is not an EXR file.
+    """
+    parts = read_parts(os.fspath(path), header_only=True)
+    return own.provenance(parts)
