@@ -1,0 +1,3 @@
+"""Makers of biased images."""
+
+from jscomb.denoisers import oidn as oidn
