@@ -1,0 +1,1 @@
+"""Experiments with jscomb: one question per file."""

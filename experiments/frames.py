@@ -1,0 +1,65 @@
+"""Frames from a folder of NumPy archives, as `Frame`, for experiments.
+
+An archive holds nested half buffers of S samples, `a_color_S` and `b_color_S`, with
+`a_variance_S` and `b_variance_S` of their means; denoised images `a_oidn_S`, `b_oidn_S`
+and `full_oidn_S`; features `a_albedo` and so on; `reference`, and the difference of its
+halves, `reference_half_difference`.
+"""
+
+import pathlib
+
+import jax.numpy as jnp
+import numpy as np
+
+from jscomb.frame import CHANNELS, Biased, Frame, Reference, make_frame
+
+
+def load(path: pathlib.Path, samples: int) -> Frame:
+    """One frame at one sample count.
+
+    Args:
+        path: an archive.
+        samples: samples a pixel of the full frame; twice one of the S.
+
+    Returns:
+        the frame: two sub-buffers, features, `oidn` with halves, and the reference.
+
+    Raises:
+        ValueError: if the archive has no such sample count; names those it has.
+    """
+    half = samples // 2
+    with np.load(path) as data:
+        if f"a_color_{half}" not in data:
+            raise ValueError(f"{path} has {sample_counts(path)} samples, not {samples}")
+
+        def pair(name: str) -> np.ndarray:
+            return np.stack([data[f"a_{name}"], data[f"b_{name}"]])
+
+        features = {name: pair(name) for name in CHANNELS if f"a_{name}" in data}
+        for name, feature in features.items():
+            features[name] = feature.reshape(*feature.shape[:3], CHANNELS[name])
+        if "albedo" in features:
+            features["albedo"] = features["albedo"].clip(0, 1)  # metals exceed 1
+        return make_frame(
+            pair(f"color_{half}"),
+            variance=pair(f"variance_{half}"),
+            samples=samples,
+            biased={
+                "oidn": Biased(
+                    jnp.asarray(data[f"full_oidn_{half}"]),
+                    jnp.asarray(pair(f"oidn_{half}")),
+                )
+            },
+            reference=Reference(
+                jnp.asarray(data["reference"]),
+                jnp.asarray(data["reference_half_difference"]),
+            ),
+            **features,
+        )
+
+
+def sample_counts(path: pathlib.Path) -> list[int]:
+    """The sample counts of the full frames in an archive, ascending."""
+    with np.load(path) as data:
+        names = [n for n in data.files if n.startswith("a_color_")]
+    return sorted(2 * int(name.rpartition("_")[2]) for name in names)
