@@ -1,0 +1,17 @@
+"""Combine unbiased and biased Monte Carlo renderings into one better image, in JAX.
+
+Each paper is one module of pure functions, and each has the verb `combine`::
+
+    from jscomb import exr, james_stein
+    frame = exr.read_frame("frame.exr")
+    denoised = frame.biased["oidn"].full
+    image = james_stein.combine(frame.color, denoised, frame.variance)
+"""
+
+from jscomb import exr as exr
+from jscomb import frame as frame
+from jscomb import james_stein as james_stein
+from jscomb import metrics as metrics
+from jscomb import numerics as numerics
+
+__version__ = "0.1.0"

@@ -1,0 +1,331 @@
+"""The command `jscomb`: combine, compare and describe rendered frames.
+
+Errors of the input are one line on standard error and exit status 2.
+"""
+
+import contextlib
+import functools
+import importlib.resources
+import io
+import os
+import pathlib
+import re
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import tyro
+
+import jscomb
+from jscomb import exr, james_stein, metrics
+from jscomb.denoisers import oidn
+from jscomb.exr import dialects
+from jscomb.frame import Frame, Reference
+from jscomb.numerics.guards import finite
+from jscomb.typing import Image, Variance
+
+Path = pathlib.Path
+_Frame = tyro.conf.Positional[Path]
+_Samples = Annotated[int | None, tyro.conf.arg(metavar="N")]
+_Biased = Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")]
+_Method = Literal["whitened", "james-stein"]
+TIMED_RUNS = 7
+_DEMO_FOLDER = Path("jscomb-demo")
+
+
+def _james_stein(x: Image, y: Image, variance: Variance) -> Image:
+    """As in the paper without its network: 15x15 windows, box-filtered variance."""
+    return james_stein.combine(x, y, james_stein.smooth_variance(variance))
+
+
+def _whitened(x: Image, y: Image, variance: Variance) -> Image:
+    """A variance for each pixel, made robust, and windows of 7x7."""
+    robust = james_stein.robust_variance(variance)
+    return james_stein.combine(x, y, robust, window=7, whiten=True)
+
+
+METHODS: dict[str, Callable[[Image, Image, Variance], Image]] = {
+    "james-stein": _james_stein,
+    "whitened": _whitened,
+}
+
+
+def demo(*, out: Path = _DEMO_FOLDER) -> None:
+    """Combine the bundled frames and show the error of every method.
+
+    The frames are of one scene, path traced with 64 and with 1024 samples a pixel, and
+    denoised by Open Image Denoise.
+
+    Args:
+        out: folder for the pictures and the combined frames.
+    """
+    from jscomb import plots  # matplotlib is slow to import
+
+    out.mkdir(parents=True, exist_ok=True)
+    frames = {file.stem: exr.read_frame(file) for file in _bundled()}
+    by_samples = sorted(frames.items(), key=lambda item: float(item[1].samples or 0))
+    table, shown, ms = {}, [], {}
+    for name, frame in by_samples:
+        denoised = frame.biased["oidn"].full
+        combined = {}
+        for method, function in METHODS.items():
+            inputs = frame.color, denoised, frame.variance
+            combined[method], time_of_one = _timed(jax.jit(function), *inputs)
+            ms[method] = f"{time_of_one:.2f}"
+            exr.write_image(out / f"{name}-{method}.exr", combined[method])
+        if oidn.available():
+            guides = {"albedo": frame.albedo, "normal": frame.normal}
+            denoise = functools.partial(oidn.denoise, **guides)
+            ms["Open Image Denoise"] = f"{_timed(denoise, frame.color)[1]:.2f}"
+        images = {"path tracing": frame.color, "Open Image Denoise": denoised}
+        table[f"{_samples(frame)} spp"] = _errors(images | combined, frame)
+        shown.append((frame, combined))
+    size = _size(by_samples[0][1])
+    print(f"relative L2 of one scene, {size}, and the time of each step")
+    _print_table({**table, "ms": ms})
+    print(
+        "This scene suits a combination; at few samples others are best left denoised."
+    )
+    picture = out / "comparison.png"
+    plots.comparison(picture, shown)
+    print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
+
+
+def combine(
+    frame: _Frame,
+    /,
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    *,
+    biased: _Biased = None,
+    method: _Method = "whitened",
+    samples: _Samples = None,
+) -> None:
+    """Combine a path-traced frame with a biased image into one better image.
+
+    Args:
+        frame: EXR file of any known renderer, or a Tungsten directory.
+        out: EXR file to write.
+        biased: EXR file of the biased image, or its name within the frame. By default
+            the frame's only one; a frame without any is denoised by Open Image Denoise.
+        method: whitened (better with most denoisers), or james-stein as in the paper
+            without its network.
+        samples: samples a pixel, where the file does not say.
+    """
+    path, loaded = frame, exr.read_frame(frame, samples=samples)
+    try:
+        variance = loaded.variance
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    name, image = _biased_image(path, loaded, biased)
+    combined = jax.jit(METHODS[method])(loaded.color, image, variance)
+    about = {
+        "jscomb": jscomb.__version__,
+        "method": method,
+        "frame": path.name,
+        "biased": name,
+        "input": exr.read_provenance(path) if path.is_file() else {},
+    }
+    exr.write_image(out, combined, provenance=about)
+    print(f"wrote {out}: {_size(loaded)}, {method} with {name}")
+    if loaded.reference is not None:
+        images = {"input": loaded.color, name: image, method: combined}
+        _print_table({"relative L2": _errors(images, loaded)})
+
+
+def compare(image: _Frame, reference: _Frame, /) -> None:
+    """Print the errors of an image against a reference.
+
+    Args:
+        image: EXR file; its colour is compared.
+        reference: EXR file; the reference in it if it is a frame that has one, else
+            its colour.
+    """
+    a, frame = exr.read_image(image), exr.read_frame(reference, statistics=False)
+    truth = frame.reference or Reference(frame.color)
+    r, noise = truth
+    if a.shape != r.shape:
+        raise ValueError(f"{image} is {a.shape}, {reference} is {r.shape}")
+    mask = finite(a, r)
+    left_out = int((~mask).sum())
+    if left_out == mask.size:
+        raise ValueError(f"{image} and {reference} have no finite pixel in common")
+    rows: dict[str, Any] = {"relative L2": metrics.rel_l2(a, r, mask=mask)}
+    if noise is not None:
+        rows["relative L2, less the reference's noise"] = metrics.rel_l2(
+            a, r, mask=mask, half_difference=noise
+        )
+    rows["RMSE"] = metrics.rmse(a, r, mask=mask)
+    rows["SMAPE"] = metrics.smape(a, r, mask=mask)
+    rows["DSSIM"] = metrics.dssim(a, r, mask=mask)
+    for name, measure in (("FLIP", metrics.flip), ("HDR-FLIP", metrics.hdr_flip)):
+        try:
+            rows[name] = measure(a, r)
+        except (ValueError, ImportError, RuntimeError) as error:
+            print(f"{name:>40}  not measured: {error}")
+    for name, value in rows.items():
+        print(f"{name:>40}  {float(value):.6g}")
+    if left_out:
+        print(f"{left_out} of {mask.size} pixels are not finite and were left out")
+
+
+def info(frame: _Frame, /, *, samples: _Samples = None) -> None:
+    """Describe a frame: dialect, buffers, sizes, samples, invalid pixels.
+
+    Args:
+        frame: EXR file of any known renderer, or a Tungsten directory.
+        samples: samples a pixel, where the file does not say.
+    """
+    path, missing = frame, None
+    try:
+        loaded = exr.read_frame(path, samples=samples)
+    except ValueError as error:
+        loaded, missing = exr.read_frame(path, statistics=False), error
+    invalid = int((~loaded.valid).sum())
+    print(f"{path}: {dialects.recognise(os.fspath(path))}")
+    if missing:
+        print(f"  no variance     {missing}")
+    print(f"  size            {_size(loaded)}")
+    count = loaded.sub_buffers
+    print(f"  samples         {_samples(loaded)} a pixel in {count} sub-buffer(s)")
+    print(f"  invalid pixels  {invalid}")
+    print(f"  exposure        {float(loaded.exposure):.4g} (median radiance)")
+    stored: dict[str, Any] = {
+        n: b for n, b in loaded.buffers._asdict().items() if b is not None
+    }
+    stored |= {f"biased {name}": b.full for name, b in loaded.biased.items()}
+    if loaded.reference is not None:
+        stored["reference"] = loaded.reference.image
+    for name, buffer in stored.items():
+        good = np.asarray(buffer)[np.isfinite(buffer)]
+        low, mean, high = (
+            (good.min(), good.mean(), good.max()) if good.size else (np.nan,) * 3
+        )
+        print(f"  {name:<15} {low:10.4g} .. {high:<10.4g} mean {mean:.4g}")
+    if path.is_file():
+        for name, value in exr.read_provenance(path).items():
+            print(f"  made with       {name} = {value}")
+
+
+def main() -> None:
+    """Run the command; the entry point of `jscomb`."""
+    _use_compilation_cache()
+    try:
+        _parse()()
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        print("jscomb:", " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
+
+
+def _parse() -> Callable[[], None]:
+    """The command line as a call to make; a wrong one is a `ValueError`."""
+
+    def later(command: Callable) -> Callable:
+        @functools.wraps(command)
+        def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
+            return lambda: command(*args, **kwargs)
+
+        return bind
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.extras.subcommand_cli_from_dict(
+                {c.__name__: later(c) for c in (demo, combine, compare, info)},
+                prog="jscomb",
+                description="Combine unbiased and biased Monte Carlo renderings.",
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise  # --help
+        text = re.sub(r"\x1b\[[0-9;]*m|[^\x00-\x7f]", " ", said.getvalue())
+        raise ValueError(text.replace("-" * 8, "")) from None
+
+
+def _use_compilation_cache() -> None:
+    """Keep compiled programs in the user's cache, so the second run starts fast."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        folder = os.path.join(cache, "jscomb", "xla")
+        jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def _bundled() -> list[Path]:
+    """The frames that come with the package."""
+    folder = importlib.resources.files(jscomb) / "data"
+    return [Path(str(f)) for f in folder.iterdir() if f.name.endswith(".exr")]
+
+
+def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Image]:
+    """Name and image of what to combine with."""
+    held = ", ".join(frame.biased) or "none"
+    if choice in frame.biased:
+        return choice, frame.biased[choice].full
+    if choice is not None:
+        if not os.path.exists(choice):
+            raise ValueError(
+                f"--biased {choice}: neither a file nor a biased image in {path} "
+                f"(it holds {held})"
+            )
+        image = exr.read_image(choice)
+        if image.shape != frame.color.shape:
+            raise ValueError(f"{choice} is {image.shape}, {path} {frame.color.shape}")
+        return Path(choice).name, image
+    if len(frame.biased) > 1:
+        raise ValueError(f"{path} holds several biased images, choose --biased: {held}")
+    for name, image in frame.biased.items():
+        return name, image.full
+    if not oidn.available():
+        raise ImportError(
+            f"{path} holds no biased image: give --biased FILE, or pip install "
+            '"jscomb[oidn]" to denoise it here'
+        )
+    return "oidn", oidn.denoise_frame(frame).full
+
+
+def _timed(function: Callable, *inputs: Image) -> tuple[Image, float]:
+    """A result, and the median milliseconds of making it again."""
+    result = jax.block_until_ready(function(*inputs))
+    times = []
+    for _ in range(TIMED_RUNS):
+        start = time.perf_counter()
+        jax.block_until_ready(function(*inputs))
+        times.append(1e3 * (time.perf_counter() - start))
+    return result, statistics.median(times)
+
+
+def _errors(images: Mapping[str, Image], frame: Frame) -> dict[str, str]:
+    """Relative L2, less the reference's noise, over the pixels that all images have."""
+    assert frame.reference is not None
+    r, noise = frame.reference
+    mask = finite(r, *images.values())
+    if left_out := int((~mask).sum()):
+        print(f"{left_out} of {mask.size} pixels are not finite and were left out")
+    error = functools.partial(metrics.rel_l2, half_difference=noise, mask=mask)
+    return {name: f"{float(error(image, r)):.5f}" for name, image in images.items()}
+
+
+def _print_table(columns: Mapping[str, Mapping[str, str]]) -> None:
+    """Columns by title, rows by the first column's names."""
+    names = list(next(iter(columns.values())))
+    cells = [
+        ["", *columns],
+        *([n, *(c.get(n, "") for c in columns.values())] for n in names),
+    ]
+    for first, *others in cells:
+        print(f"  {first:<22}{''.join(f'{c:>14}' for c in others)}".rstrip())
+
+
+def _samples(frame: Frame) -> str:
+    """Samples a pixel."""
+    return "unknown" if frame.samples is None else f"{float(frame.samples):g}"
+
+
+def _size(frame: Frame) -> str:
+    """Width x height."""
+    height, width = frame.color.shape[:2]
+    return f"{width}x{height}"

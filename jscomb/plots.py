@@ -1,0 +1,84 @@
+"""Pictures of images beside their errors."""
+
+import os
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Array
+from matplotlib.axes import Axes
+
+from jscomb.frame import Frame
+from jscomb.metrics import rel_l2, tone_map
+from jscomb.numerics.guards import finite
+from jscomb.typing import Image
+
+_ERRORS = (1e-4, 1e0)  # relative squared error from black to white
+
+
+def comparison(
+    path: str | os.PathLike, frames: Sequence[tuple[Frame, dict[str, Image]]]
+) -> None:
+    """Write a picture: for each frame a row of images and a row of error maps.
+
+    Args:
+        path: PNG file to write.
+        frames: each a frame with a reference, and combined images of it by name, linear
+            radiance, [H,W,3]. The frame's colour and biased images stand before them.
+
+    Returns:
+        nothing.
+
+    Raises:
+        ValueError: if a frame has no reference.
+    """
+    rows = []
+    for frame, combined in frames:
+        if frame.reference is None:
+            raise ValueError("a comparison needs a frame with a reference")
+        spp = "" if frame.samples is None else f", {float(frame.samples):.0f} spp"
+        inputs = {f"path tracing{spp}": frame.color}
+        inputs |= {name: image.full for name, image in frame.biased.items()}
+        rows.append((frame.reference, inputs | combined))
+    columns = 1 + max(len(images) for _, images in rows)
+    figure, axes = plt.subplots(
+        2 * len(rows),
+        columns,
+        figsize=(3 * columns, 6.6 * len(rows)),
+        squeeze=False,
+        layout="compressed",
+    )
+    for axis in axes.flat:
+        axis.axis("off")
+    for number, (reference, images) in enumerate(rows):
+        above, below = axes[2 * number], axes[2 * number + 1]
+        for axis, under, (name, image) in zip(
+            above, below, images.items(), strict=False
+        ):
+            _show(axis, image, name)
+            r, noise = reference
+            mask = finite(image, r)
+            error = float(rel_l2(image, r, half_difference=noise, mask=mask))
+            _show_error(under, image, r, f"relative L2 {error:.5f}")
+        _show(above[len(images)], reference.image, "reference")
+    low, high = _ERRORS
+    note = f"below: relative squared error, black {low:g} to white {high:g}"
+    figure.supxlabel(note, fontsize=9)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _show(axis: Axes, image: Array, title: str) -> None:
+    """An image as a display shows it."""
+    axis.imshow(np.asarray(tone_map(image)), interpolation="nearest")
+    axis.set_title(title, fontsize=9)
+
+
+def _show_error(axis: Axes, image: Array, reference: Array, title: str) -> None:
+    """Relative squared error of each pixel, logarithmic."""
+    square = np.mean((np.asarray(image) - reference) ** 2, axis=-1)
+    relative = square / (np.mean(reference, axis=-1) ** 2 + 0.01)
+    low, high = np.log10(_ERRORS)
+    shown = np.log10(np.maximum(relative, 1e-30))
+    axis.imshow(shown, cmap="magma", vmin=low, vmax=high, interpolation="nearest")
+    axis.set_title(title, fontsize=9)
