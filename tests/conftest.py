@@ -1,0 +1,38 @@
+"""Strict arithmetic for every test: no silent broadcast, promotion or key reuse."""
+
+import pathlib
+
+import jax
+import jaxtyping
+import matplotlib as mpl
+import pytest
+
+from jscomb import exr
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_debug_key_reuse", True)
+mpl.use("agg")
+
+DATA = pathlib.Path(__file__).parent / "data"
+
+
+@pytest.fixture
+def unchecked():
+    """As users run it: without jaxtyping's checks, which would answer first."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="session", params=["cornell-glass-64", "cornell-box-64"])
+def real_frame(request):
+    """A 64x64 crop of a real path-traced frame with four sub-buffers, float32."""
+    return exr.read_frame(DATA / f"{request.param}.exr")
+
+
+@pytest.fixture(scope="session")
+def glass_frame():
+    """The crop around the caustic, 64 samples a pixel."""
+    return exr.read_frame(DATA / "cornell-glass-64.exr")

@@ -1,0 +1,265 @@
+"""The command: every subcommand for real, and one line with status 2 for bad input."""
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jscomb import cli, exr, metrics
+from jscomb.numerics.guards import finite
+from tests.conftest import DATA
+from tests.test_exr import layer, noise, write
+
+GLASS = DATA / "cornell-glass-64.exr"
+
+
+@pytest.fixture
+def jscomb(monkeypatch, capsys):
+    """Run the command in this process; returns status, output and error."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["jscomb", *map(os.fspath, arguments)])
+        monkeypatch.setattr(cli, "_use_compilation_cache", lambda: None)
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def errors_in(text, column=0):
+    """A column of the printed table, by method."""
+    rows = re.findall(r"^ {2}(\S.*?) {2,}((?:[\d.]+ *)+)$", text, re.M)
+    return {name: float(values.split()[column]) for name, values in rows}
+
+
+def test_demo(jscomb, tmp_path):
+    status, out, _ = jscomb("demo", "--out", tmp_path / "demo")
+    assert status == 0
+    few, many = errors_in(out, 0), errors_in(out, 1)
+    methods = {"path tracing", "Open Image Denoise", "james-stein", "whitened"}
+    assert few.keys() == many.keys() == methods
+    assert all(many[name] < few[name] for name in methods)
+    assert {p.name for p in (tmp_path / "demo").iterdir()} == {
+        "comparison.png",
+        *(f"cornell-glass-{n}-{m}.exr" for n in (64, 1024) for m in cli.METHODS),
+    }
+    assert os.fspath((tmp_path / "demo").resolve()) in out
+
+
+@pytest.mark.parametrize("method", ["james-stein", "whitened"])
+def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
+    path = tmp_path / "out.exr"
+    status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)
+    assert status == 0
+    image = exr.read_image(path)
+    r, noise = glass_frame.reference
+    error = float(metrics.rel_l2(image, r, half_difference=noise))
+    np.testing.assert_allclose(errors_in(out)[method], error, atol=6e-6)
+    about = exr.read_provenance(path)
+    assert (about["method"], about["biased"]) == (method, "oidn")
+    assert about["input"]["scene"] == "cornell-glass"
+
+
+def test_combine_with_a_file(jscomb, tmp_path, glass_frame):
+    biased = tmp_path / "flat.exr"
+    exr.write_image(biased, np.zeros((64, 64, 3)))
+    status, out, _ = jscomb(
+        "combine", GLASS, "--biased", biased, "--out", tmp_path / "out.exr"
+    )
+    assert status == 0
+    assert "with flat.exr" in out
+    named = jscomb("combine", GLASS, "--biased", "oidn", "-o", tmp_path / "named.exr")
+    assert named[0] == 0
+
+
+def test_combine_denoises_what_is_not(jscomb, tmp_path, glass_frame):
+    """A pbrt-style file without a denoised image, as an artist would have it."""
+    f = glass_frame
+    channels = {
+        **layer("", np.asarray(f.color)),
+        **layer("Albedo", np.asarray(f.albedo)),
+        **layer("Ns", np.asarray(f.normal), "XYZ"),
+        **layer("Variance", 64 * np.asarray(f.variance)),
+    }
+    frame = write(tmp_path / "pbrt.exr", channels, samplesPerPixel=64)
+    status, out, _ = jscomb("combine", frame, "-o", tmp_path / "out.exr")
+    assert status == 0
+    assert "with oidn" in out
+    r, noise = f.reference
+    status, out, _ = jscomb("compare", tmp_path / "out.exr", GLASS)
+    expected = float(
+        metrics.rel_l2(exr.read_image(tmp_path / "out.exr"), r, half_difference=noise)
+    )
+    found = float(re.search(r"less the reference's noise +([\d.e-]+)", out)[1])
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert found < float(metrics.rel_l2(f.color, r)) / 5
+
+
+def test_compare(jscomb, tmp_path):
+    image = noise(0, 20, 20, 3)
+    image[3, 4] = np.nan
+    a = write(tmp_path / "a.exr", layer("", image))
+    b = write(tmp_path / "b.exr", layer("", np.nan_to_num(image, nan=1.0)))
+    status, out, _ = jscomb("compare", a, b)
+    assert status == 0
+    assert "1 of 400 pixels are not finite and were left out" in out
+    assert re.search(r"relative L2 +0$", out, re.M)
+    assert "FLIP  not measured: image must have pixels and be finite" in out
+    status, out, _ = jscomb("compare", b, b)
+    assert re.search(r"HDR-FLIP +0$", out, re.M)
+
+
+def test_info(jscomb, tmp_path):
+    status, out, _ = jscomb("info", GLASS)
+    assert status == 0
+    for expected in (
+        "jscomb",
+        "64x64",
+        "64 a pixel in 4 sub-buffer",
+        "invalid pixels  0",
+        "albedo",
+        "biased oidn",
+        "scene = cornell-glass",
+    ):
+        assert expected in out
+    bad = noise(0, 4, 4, 3)
+    bad[1, 2] = np.inf
+    status, out, _ = jscomb("info", write(tmp_path / "b.exr", layer("", bad)))
+    assert "invalid pixels  1" in out
+    assert "samples         unknown" in out
+
+
+def test_info_of_moments_without_their_number(jscomb, tmp_path):
+    """The file is described all the same, and says what it lacks."""
+    path = moments(tmp_path)
+    status, out, _ = jscomb("info", path)
+    assert status == 0
+    assert re.search(r"no variance .*moments\.exr: .*give the samples a pixel", out)
+    status, out, _ = jscomb("info", path, "--samples", "9")
+    assert "no variance" not in out
+    assert re.search(r"^ {2}variance ", out, re.M)
+
+
+def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
+    """Else a method would look good for the pixels that it lacks."""
+    color = glass_frame.buffers.color.at[:, 10:15, 10:15].set(np.nan)
+    buffers = glass_frame.buffers._replace(color=color)
+    exr.write_frame(tmp_path / "f.exr", glass_frame._replace(buffers=buffers))
+    status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
+    assert status == 0
+    assert "25 of 4096 pixels are not finite and were left out" in out
+    r, noise = glass_frame.reference
+    mask = finite(color[0])
+    y = glass_frame.biased["oidn"].full
+    error = metrics.rel_l2(y, r, half_difference=noise, mask=mask)
+    np.testing.assert_allclose(errors_in(out)["oidn"], float(error), atol=6e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["combine", "f.exr"], "-o PATH"),
+        (["combine", "f.exr", "-o", "o.exr", "--method", "median"], "'median'"),
+        (["demo", "--nope"], "--nope"),
+        (["frobnicate"], "frobnicate"),
+        ([], "demo, combine, compare, info"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_too(jscomb, arguments, message):
+    status, out, error = jscomb(*arguments)
+    assert (status, out) == (2, "")
+    assert re.fullmatch(r"jscomb: [ -~]+\n", error)
+    assert message in error
+
+
+def test_help_reads_well(jscomb):
+    for command in ((), ("demo",), ("combine",), ("compare",), ("info",)):
+        status, out, _ = jscomb(*command, "--help")
+        assert status == 0
+        assert "usage: jscomb" in out
+        assert "{None}" not in out
+    assert "{whitened,james-stein}" in jscomb("combine", "--help")[1]
+
+
+def truncated(folder):
+    path = folder / "cut.exr"
+    path.write_bytes(GLASS.read_bytes()[:300_000])
+    return path
+
+
+def without_statistics(folder):
+    return write(folder / "plain.exr", layer("", noise(0, 9, 9, 3)))
+
+
+def moments(folder):
+    image = noise(0, 9, 9, 4)
+    channels = layer("n.img", image, "RGBA") | layer("m2_n.img", image, "RGBA")
+    return write(folder / "moments.exr", channels, generatedBy="Mitsuba")
+
+
+def several(folder):
+    frame = exr.read_frame(GLASS)
+    exr.write_frame(folder / "two.exr", frame.with_biased("other", frame.color))
+    return folder / "two.exr"
+
+
+BAD = {
+    "truncated": (truncated, [], r"cut\.exr: truncated or corrupt"),
+    "missing": (lambda d: d / "no.exr", [], r"no\.exr: no such file"),
+    "directory": (lambda d: d, [], "holds neither color.exr nor colorA.exr"),
+    "no variance": (without_statistics, [], r"plain\.exr: .*neither variance nor"),
+    "no samples": (moments, [], r"moments\.exr: .*give the samples a pixel"),
+    "several": (several, [], r"two\.exr holds several biased images.*oidn, other"),
+    "count": (lambda d: GLASS, ["--samples", "-5"], "samples must be at least 1"),
+    "biased": (lambda d: GLASS, ["--biased", "nlm"], "neither a file nor a biased"),
+    "no image": (lambda d: GLASS, ["--biased", os.fspath(DATA)], "holds neither"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_status_2(jscomb, tmp_path, case):
+    make, arguments, message = BAD[case]
+    folder = tmp_path / "in"
+    folder.mkdir()
+    frame = make(folder)
+    if case in ("no variance", "no samples"):
+        biased = write(folder / "biased.exr", layer("", noise(1, 9, 9, 3)))
+        arguments = [*arguments, "--biased", biased]
+    status, out, error = jscomb("combine", frame, "-o", tmp_path / "x.exr", *arguments)
+    assert status == 2
+    assert out == ""
+    assert error.count("\n") == 1
+    assert error.startswith("jscomb: ")
+    assert re.search(message, error)
+    assert not (tmp_path / "x.exr").exists()
+
+
+def test_sizes_must_agree(jscomb, tmp_path):
+    small = write(tmp_path / "small.exr", layer("", noise(0, 9, 9, 3)))
+    for arguments in (
+        ("combine", GLASS, "--biased", small, "-o", tmp_path / "x.exr"),
+        ("compare", small, GLASS),
+    ):
+        status, _, error = jscomb(*arguments)
+        assert status == 2
+        assert re.search(r"small\.exr is \(9, 9, 3\)", error)
+
+
+def test_from_the_shell(tmp_path):
+    """As a process: exit status, streams, no traceback."""
+    done = subprocess.run(
+        [sys.executable, "-m", "jscomb", "info", truncated(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert re.fullmatch(r"jscomb: .*cut\.exr: truncated.*\n", done.stderr)

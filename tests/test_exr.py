@@ -1,0 +1,471 @@
+"""EXR: bit-exact round trips, every dialect, and files that nobody should trust."""
+
+import json
+import os
+
+import jax
+import numpy as np
+import OpenEXR
+import pytest
+
+from jscomb import exr
+from jscomb.exr import files, own
+from jscomb.exr.files import Part, read_parts, write_parts
+from jscomb.frame import Biased, Reference, make_frame
+
+H, W = 12, 10
+
+
+def noise(seed, *shape):
+    return np.random.default_rng(seed).random(shape, np.float32)
+
+
+def layer(name, image, suffixes="RGB"):
+    """Channels of an image under a prefix."""
+    prefix = f"{name}." if name else ""
+    return {prefix + s: image[..., c] for c, s in enumerate(suffixes)}
+
+
+def write(path, channels, **attributes):
+    """A single-part file as any renderer might write it."""
+    write_parts(os.fspath(path), [Part("", channels, attributes)])
+    return path
+
+
+@pytest.fixture
+def frame():
+    """Two sub-buffers, everything there, float32 of any bits."""
+    color = noise(0, 2, H, W, 3)
+    color[0, 0, 0] = np.nan
+    color[0, 0, 1] = np.inf, 1e-30, 1e30
+    return make_frame(
+        color,
+        variance=noise(1, 2, H, W, 3),
+        albedo=noise(2, 2, H, W, 3),
+        normal=noise(3, H, W, 3),
+        depth=noise(4, 2, H, W, 1),
+        samples=6,
+        biased={
+            "oidn": Biased(*map(jax.numpy.asarray, (color[0], color))),
+            "smooth": color[1],
+        },
+        reference=Reference(*map(jax.numpy.asarray, noise(5, 2, H, W, 3))),
+    )
+
+
+def assert_same(a, b):
+    """Bit by bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(
+            np.asarray(one).view(np.uint32), np.asarray(other).view(np.uint32)
+        )
+
+
+def test_round_trip_is_exact(frame, tmp_path):
+    path = tmp_path / "größe 木.exr"
+    provenance = {"seed": 2**40, "list": [1, None, True], "name": "木"}
+    exr.write_frame(path, frame, provenance=provenance)
+    assert_same(exr.read_frame(path), frame)
+    assert exr.read_provenance(path) == provenance
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    exr.write_frame(path, exr.read_frame(path), provenance=exr.read_provenance(path))
+    assert_same(exr.read_frame(path), frame)
+
+
+def test_round_trip_of_little(tmp_path):
+    path = tmp_path / "plain.exr"
+    plain = make_frame(noise(0, 1, 1, 3))
+    exr.write_frame(path, plain)
+    assert_same(exr.read_frame(path), plain)
+    assert exr.read_provenance(path) == {}
+
+
+def test_sixteen_bits_on_request(frame, tmp_path):
+    path = tmp_path / "half.exr"
+    exr.write_frame(path, frame, half=("albedo", "half_difference"))
+    back = exr.read_frame(path)
+    np.testing.assert_allclose(back.albedo, frame.albedo, rtol=1e-3)
+    assert not np.array_equal(back.albedo, frame.albedo)
+    np.testing.assert_array_equal(back.color, frame.color)
+    with pytest.raises(ValueError, match="color has values that do not fit"):
+        exr.write_frame(path, frame, half=("color",))
+    with pytest.raises(ValueError, match=r"half names \['colour'\]"):
+        exr.write_frame(path, frame, half=("colour",))
+
+
+@pytest.mark.parametrize("name", ["a", "reference", "x.y", ""])
+def test_reserved_names(frame, tmp_path, name):
+    with pytest.raises(ValueError, match="cannot be called"):
+        exr.write_frame(tmp_path / "x.exr", frame.with_biased(name, frame.color))
+    assert not list(tmp_path.iterdir())
+
+
+def test_arrays_that_are_not_contiguous(tmp_path):
+    """The binding alone would write wrong pixels without a word."""
+    image = noise(0, W, H, 4).transpose(1, 0, 2)[::-1, :, :3]
+    assert not image.flags.c_contiguous
+    exr.write_image(tmp_path / "i.exr", image)
+    np.testing.assert_array_equal(exr.read_image(tmp_path / "i.exr"), image)
+    with pytest.raises(ValueError, match=r"image must have shape \[H,W,3\]"):
+        exr.write_image(tmp_path / "i.exr", image[..., :1])
+
+
+def test_samples_override(frame, tmp_path):
+    exr.write_frame(tmp_path / "f.exr", frame)
+    assert exr.read_frame(tmp_path / "f.exr", samples=9).samples == 9
+
+
+# What other programs write
+
+
+def test_rgb_and_grey(tmp_path):
+    image = noise(0, H, W, 3)
+    path = write(tmp_path / "i.exr", layer("", image) | {"A": image[..., 0]})
+    np.testing.assert_array_equal(exr.read_frame(path).color, image)
+    grey = write(tmp_path / "y.exr", {"Y": image[..., 0]})
+    np.testing.assert_array_equal(exr.read_frame(grey).color[..., 2], image[..., 0])
+
+
+def test_half_and_float_in_one_image(tmp_path):
+    image = noise(0, H, W, 3)
+    channels = layer("", image)
+    channels["G"] = channels["G"].astype(np.float16)
+    color = exr.read_frame(write(tmp_path / "i.exr", channels)).color
+    assert color.dtype == np.float32
+    np.testing.assert_allclose(color, image, rtol=1e-3)
+
+
+def test_mitsuba_layout(tmp_path):
+    mean, second = noise(0, H, W, 3), 1 + noise(1, H, W, 3)
+    up = np.broadcast_to(np.float32([0, 0.6, 0.8]), (H, W, 3))
+    far = 7 * noise(2, H, W, 3)
+    channels = {
+        **layer("", noise(3, H, W, 3)),
+        **layer("nested", noise(4, H, W, 3), "XYZ"),
+        **layer("nested.img", np.concatenate([mean, mean[..., :1]], -1), "RGBA"),
+        **layer("m2_nested.img", np.concatenate([second, mean[..., :1]], -1), "RGBA"),
+        **layer("nested.alb", 3 * noise(5, H, W, 3)),
+        **layer("nested.position", far, "XYZ"),
+        **layer("nested.sh", up, "XYZ"),
+        **layer("nested.dd.y", far[..., :1], "T"),
+        **layer("nested.uv", far[..., :2], "UV"),
+    }
+    path = write(tmp_path / "m.exr", channels, generatedBy="Mitsuba version 3.9.1")
+    frame = exr.read_frame(path, samples=17)
+    np.testing.assert_array_equal(frame.color, mean)
+    np.testing.assert_allclose(frame.variance, (second - mean**2) / 16, rtol=1e-6)
+    np.testing.assert_array_equal(frame.albedo, np.minimum(3 * noise(5, H, W, 3), 1))
+    np.testing.assert_array_equal(frame.normal, up)
+    np.testing.assert_array_equal(frame.depth, far[..., :1])
+    with pytest.raises(ValueError, match=r"m\.exr: read as mitsuba: .*give the sampl"):
+        exr.read_frame(path)
+    np.testing.assert_array_equal(exr.read_image(path), mean)
+
+
+def test_mitsuba_with_the_names_of_pbrt(tmp_path):
+    """Users of `aov` choose the names; who wrote the file decides."""
+    image = np.concatenate([noise(0, H, W, 3), noise(1, H, W, 1)], -1)
+    channels = {
+        **layer("img", image, "RGBA"),
+        **layer("Albedo", noise(2, H, W, 3)),
+        **layer("P", noise(3, H, W, 3), "XYZ"),
+        **layer("depth", noise(4, H, W, 1), "T"),
+    }
+    frame = exr.read_frame(write(tmp_path / "m.exr", channels, generatedBy="Mitsuba"))
+    np.testing.assert_array_equal(frame.color, image[..., :3])
+    np.testing.assert_array_equal(frame.depth, noise(4, H, W, 1))
+
+
+def test_mitsuba_xyz_moments_are_not_taken_for_rgb(tmp_path):
+    channels = {
+        **layer("", noise(0, H, W, 3)),
+        **layer("nested", noise(1, H, W, 3), "XYZ"),
+        **layer("m2_nested", noise(2, H, W, 3), "XYZ"),
+    }
+    frame = exr.read_frame(write(tmp_path / "m.exr", channels))
+    np.testing.assert_array_equal(frame.color, noise(0, H, W, 3))
+    assert frame.buffers.variance is None
+
+
+def test_pbrt(tmp_path):
+    color, variance = noise(0, H, W, 3), noise(1, H, W, 3)
+    normal, albedo = noise(2, H, W, 3), noise(3, H, W, 3)
+    for image in (variance, normal, albedo):
+        image[0, 0] = 0  # the sky
+    variance[1, 1] = 0  # a black surface: exact
+    channels = {
+        **layer("", color),
+        **layer("Albedo", albedo),
+        **layer("Ns", normal, "XYZ"),
+        **layer("N", 0 * normal, "XYZ"),
+        **layer("Variance", variance),
+    }
+    path = write(tmp_path / "p.exr", channels, samplesPerPixel=16)
+    frame = exr.read_frame(path)
+    assert frame.samples == 16
+    np.testing.assert_array_equal(frame.normal, normal)
+    np.testing.assert_array_equal(frame.albedo, albedo)
+    assert np.isnan(frame.variance[0, 0]).all()
+    np.testing.assert_array_equal(frame.variance[1, 1], 0)
+    np.testing.assert_allclose(frame.variance[2:], variance[2:] / 16, rtol=1e-6)
+    np.testing.assert_array_equal(np.argwhere(~frame.valid), [[0, 0, 0]])
+    np.testing.assert_allclose(
+        exr.read_frame(path, samples=4).variance[2:], variance[2:] / 4, rtol=1e-6
+    )
+    unknown = write(tmp_path / "q.exr", channels)
+    with pytest.raises(ValueError, match="samplesPerPixel is missing"):
+        exr.read_frame(unknown)
+
+
+def test_pbrt_old_names(tmp_path):
+    channels = layer("", noise(0, H, W, 3)) | {
+        "Nsx": noise(1, H, W),
+        "Nsy": noise(2, H, W),
+        "Nsz": noise(3, H, W),
+    }
+    frame = exr.read_frame(write(tmp_path / "p.exr", channels))
+    np.testing.assert_array_equal(frame.normal[..., 2], noise(3, H, W))
+
+
+def test_tungsten_directory(tmp_path):
+    a, b = noise(0, H, W, 3), noise(1, H, W, 3)
+    depth = noise(2, H, W)
+    depth[0, 0] = np.inf
+    for name, image in {"color": (a + b) / 2, "colorA": a, "colorB": b}.items():
+        write(tmp_path / f"{name}.exr", layer("", image))
+    write(tmp_path / "colorVariance.exr", layer("", noise(3, H, W, 3)))
+    write(tmp_path / "depth.exr", {"Y": depth})
+    for half, image in zip("AB", (a, b), strict=True):
+        write(tmp_path / f"albedo{half}.exr", layer("", image))
+    (tmp_path / "nlm").mkdir()
+    for suffix, image in zip(("", "A", "B"), (a + b, a, b), strict=True):
+        write(tmp_path / "nlm" / f"nlm{suffix}.exr", layer("", image))
+    frame = exr.read_frame(tmp_path, samples=32)
+    first, second = frame.halves()
+    np.testing.assert_array_equal(first.color, a)
+    np.testing.assert_array_equal(second.albedo, b)
+    np.testing.assert_allclose(frame.variance, noise(3, H, W, 3), rtol=1e-6)
+    assert frame.depth[0, 0, 0] == 0
+    np.testing.assert_array_equal(first.depth, frame.depth)
+    np.testing.assert_array_equal(second.biased["nlm"].full, b)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"empty: .*neither color\.exr nor colorA"):
+        exr.read_frame(tmp_path / "empty")
+
+
+def test_njs_file(tmp_path):
+    full, a = noise(0, H, W, 3), noise(1, H, W, 3)
+    channels = {
+        **layer("default", full),
+        **layer("subColorA", a),
+        **layer("albedo", full),
+        **layer("albedoA", a),
+        **layer("depth", full),
+        **layer("colorVariance", noise(2, H, W, 3)),
+    }
+    for name in ("depth", "depthA"):
+        channels |= layer(name, np.where(np.arange(W)[:, None] < 2, np.inf, full))
+    frame = exr.read_frame(write(tmp_path / "n.exr", channels))
+    assert frame.valid.all()
+    np.testing.assert_array_equal(frame.buffers.depth[:, :, :2], 0)
+    np.testing.assert_allclose(frame.color, full, rtol=1e-6)
+    np.testing.assert_array_equal(frame.halves()[0].color, a)
+    np.testing.assert_array_equal(frame.halves()[1].color, 2 * full - a)
+    np.testing.assert_allclose(frame.variance, noise(2, H, W, 3), rtol=1e-6)
+    assert frame.depth.shape == (H, W, 1)
+
+
+@pytest.mark.parametrize(
+    ("data", "display"),
+    [
+        ((2, 3, 11, 14), (0, 0, 19, 29)),  # a crop
+        ((-2, -1, 7, 10), (0, 0, 4, 6)),  # overscan
+        ((5, 5, 14, 16), (0, 0, 3, 3)),  # nothing in common
+    ],
+)
+def test_data_windows_are_placed(tmp_path, data, display):
+    x0, y0, x1, y1 = data
+    pixels = noise(0, y1 - y0 + 1, x1 - x0 + 1)
+    corners = lambda w: (np.int32(w[:2]), np.int32(w[2:]))
+    header = {"dataWindow": corners(data), "displayWindow": corners(display)}
+    path = write(tmp_path / "c.exr", {"Y": pixels}, **header)
+    image = np.asarray(exr.read_image(path)[..., 0])
+    assert image.shape == (display[3] + 1, display[2] + 1)
+    for row, column in np.ndindex(*image.shape):
+        inside = x0 <= column <= x1 and y0 <= row <= y1
+        expected = pixels[row - y0, column - x0] if inside else np.nan
+        np.testing.assert_array_equal(image[row, column], expected)
+
+
+# Files that nobody should trust
+
+
+@pytest.fixture
+def good(frame, tmp_path):
+    path = tmp_path / "good.exr"
+    exr.write_frame(path, frame)
+    return path
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.3, 0.7, 0.999])
+def test_truncated_files_are_refused(good, tmp_path, share, capfd):
+    cut = tmp_path / "cut.exr"
+    data = good.read_bytes()
+    cut.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ValueError, match=r"cut\.exr: ") as error:
+        exr.read_frame(cut)
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_no_bit_flip_passes_in_silence(good, tmp_path):
+    """Noise is stored uncompressed, so ZIP's own checksum would miss most of these."""
+    data, bad = good.read_bytes(), tmp_path / "bad.exr"
+    original = exr.read_frame(good)
+    refused = 0
+    for place in np.linspace(len(data) // 3, len(data) - 9, 25).astype(int):
+        flipped = bytearray(data)
+        flipped[place] ^= 0x10
+        bad.write_bytes(flipped)
+        try:
+            assert_same(exr.read_frame(bad), original)
+        except ValueError:
+            refused += 1
+    assert refused >= 20
+
+
+def test_text_and_nothing(tmp_path):
+    text = tmp_path / "text.exr"
+    text.write_text("not an image\n" * 50)
+    with pytest.raises(ValueError, match=r"text\.exr: not a readable EXR file"):
+        exr.read_frame(text)
+    text.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"text\.exr: .*is empty"):
+        exr.read_frame(text)
+    with pytest.raises(FileNotFoundError, match=r"none\.exr: no such file"):
+        exr.read_frame(tmp_path / "none.exr")
+    with pytest.raises(ValueError, match="unknown dialect 'maya'"):
+        exr.read_frame(text, dialect="maya")
+
+
+def test_missing_channels_are_named(tmp_path):
+    path = write(tmp_path / "f.exr", {"R": noise(0, H, W), "Z": noise(1, H, W)})
+    with pytest.raises(ValueError, match=r"f\.exr: no colour channels .* among R, Z"):
+        exr.read_frame(path)
+    with pytest.raises(ValueError, match=r"f\.exr: .*channels R, G, B are missing"):
+        exr.read_frame(path, dialect="pbrt")
+
+
+def parts_of(path):
+    return {part.name: part for part in read_parts(os.fspath(path))}
+
+
+def own_file(path, parts, **about):
+    """A file of ours of these parts, with a wrong or right attribute."""
+    crc = {part.name: own._checksum(part.channels) for part in parts}
+    about = {"version": 1, "sub_buffers": 2, "crc32": crc} | about
+    first, *others = (Part(part.name, part.channels, {}) for part in parts)
+    first = first._replace(attributes={"jscomb": json.dumps(about)})
+    write_parts(os.fspath(path), [first, *others])
+    return path
+
+
+def test_own_file_with_something_missing(good, tmp_path):
+    path = tmp_path / "broken.exr"
+    parts = parts_of(good)
+    half = parts["b"]._replace(channels={"R": parts["b"].channels["R"]})
+    own_file(path, [parts["a"], half])
+    with pytest.raises(ValueError, match=r"broken\.exr: .*part b lacks channels R, G"):
+        exr.read_frame(path)
+    crc = {"a": 0, "b": 0}
+    for about, message in (
+        ({"crc32": crc}, "must have the parts a, b, but has a$"),
+        ({"version": 99}, "format version 99 is not known"),
+        ({"crc32": []}, "must have the parts"),
+        ({"crc32": 5}, "attribute jscomb is malformed"),
+        ({"sub_buffers": None, "crc32": {"a": 1}}, "part a is corrupt"),
+    ):
+        own_file(path, [parts["a"]], **about)
+        with pytest.raises(ValueError, match=rf"broken\.exr: .*{message}"):
+            exr.read_frame(path)
+
+
+def test_attributes_of_other_programs(tmp_path):
+    channels = layer("", noise(0, H, W, 3)) | layer("Albedo", noise(1, H, W, 3))
+    path = write(tmp_path / "p.exr", channels, provenance="Rendered by hand")
+    assert exr.read_provenance(path) == {"provenance": "Rendered by hand"}
+    write(path, channels, samplesPerPixel="64")
+    with pytest.raises(ValueError, match=r"p\.exr: .*samplesPerPixel is '64', not a"):
+        exr.read_frame(path)
+    write(path, channels, samplesPerPixel=0)
+    with pytest.raises(ValueError, match=r"p\.exr: .*samples must be positive, got 0"):
+        exr.read_frame(path)
+    with pytest.raises(ValueError, match=r"p\.exr: samples must be at least 1, got -5"):
+        exr.read_frame(path, samples=-5)
+
+
+def test_flipped_headers_are_refused_in_one_way(good, tmp_path):
+    data, bad = good.read_bytes(), tmp_path / "bad.exr"
+    for place in range(8, 900, 7):
+        flipped = bytearray(data)
+        flipped[place] ^= 0x24
+        bad.write_bytes(flipped)
+        message = os.fspath(bad)  # where the flip does no harm
+        try:
+            exr.read_frame(bad)
+        except ValueError as error:
+            message = str(error)
+        assert os.fspath(bad) in message
+
+
+def test_sizes_that_differ(tmp_path):
+    write(tmp_path / "colorA.exr", layer("", noise(0, H, W, 3)))
+    write(tmp_path / "colorB.exr", layer("", noise(0, H, W, 3)))
+    write(tmp_path / "depth.exr", {"Y": noise(0, H, W + 1)})
+    with pytest.raises(ValueError, match=r"depth has shape \(1, 12, 11, 1\)"):
+        exr.read_frame(tmp_path)
+    write(tmp_path / "colorB.exr", layer("", noise(0, H, W - 1, 3)))
+    with pytest.raises(ValueError, match=r"colorA is \(12, 10\), colorB is \(12, 9\)"):
+        exr.read_frame(tmp_path)
+
+
+def test_claims_are_checked_before_pixels_are_read(tmp_path, monkeypatch):
+    path = write(tmp_path / "f.exr", layer("", noise(0, H, W, 3)))
+    monkeypatch.setattr(files, "MAX_BYTES", H * W * 12 - 1)
+    with pytest.raises(ValueError, match=r"f\.exr: claims .* of pixels"):
+        exr.read_frame(path)
+
+
+def test_claimed_tiles_are_checked(tmp_path):
+    path = os.fspath(tmp_path / "tiles.exr")
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize, tiles.ySize = 16384, 16384
+    header = {"type": OpenEXR.tiledimage, "tiles": tiles}
+    OpenEXR.File(header, {"Y": noise(0, H, W)}).write(path)
+    assert os.path.getsize(path) < 100_000
+    with pytest.raises(ValueError, match=r"tiles\.exr: claims tiles of 1024 MiB"):
+        exr.read_frame(path)
+
+
+def test_a_failed_write_loses_nothing(good, frame, tmp_path, monkeypatch):
+    before = good.read_bytes()
+
+    def fail(*_):
+        raise RuntimeError("No space left on device.")
+
+    monkeypatch.setattr(files.OpenEXR.File, "write", fail)
+    with pytest.raises(OSError, match=r"good\.exr: cannot be written: No space left"):
+        exr.write_frame(good, frame)
+    assert good.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["good.exr"]
+
+
+def test_places_that_cannot_be_written(frame, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"x\.exr: there is no folder"):
+        exr.write_frame(tmp_path / "none" / "x.exr", frame)
+    with pytest.raises(IsADirectoryError, match="is a folder"):
+        exr.write_frame(tmp_path, frame)
+    with pytest.raises(OSError, match=r"^/proc/x\.exr: cannot be written: "):
+        exr.write_frame("/proc/x.exr", frame)

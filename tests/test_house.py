@@ -1,0 +1,112 @@
+"""The rules of the house, checked on the source and on the public functions."""
+
+import ast
+import importlib
+import inspect
+import pathlib
+import pkgutil
+import re
+import tomllib
+
+import pytest
+
+import jscomb
+
+# Each room may use those before it, never one after it.
+ROOMS = [
+    "typing",
+    "numerics",
+    "frame",
+    "metrics",
+    "james_stein",
+    "denoisers",
+    "exr",
+    "plots",
+    "cli",
+    "__main__",
+    "jscomb",
+]
+COMBINERS = {"james_stein"}
+ROOT = pathlib.Path(__file__).parents[1]
+MODULES = [
+    importlib.import_module(m.name)
+    for m in pkgutil.walk_packages(jscomb.__path__, "jscomb.")
+]
+FUNCTIONS = [
+    pytest.param(f, id=f"{f.__module__}.{f.__name__}")
+    for module in MODULES
+    for name, f in inspect.getmembers(module, inspect.isfunction)
+    if f.__module__ == module.__name__
+    and not name.startswith("_")
+    and module.__name__ != "jscomb.cli"  # its docstrings are the command's help
+]
+
+
+def room(module: str) -> int:
+    """The position in `ROOMS` of a dotted module name of the package."""
+    return ROOMS.index([*module.split("."), "jscomb"][1])
+
+
+def imports_of(path: pathlib.Path) -> set[str]:
+    """Dotted names of everything of ours that a file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module == "jscomb":
+            names |= {f"jscomb.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return {name for name in names if name.split(".")[0] == "jscomb"}
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda m: m.__name__)
+def test_imports_flow_one_way(module):
+    ours = imports_of(pathlib.Path(module.__file__))
+    below = {name for name in ours if room(name) > room(module.__name__)}
+    if module.__name__ == "jscomb.cli":
+        below -= {"jscomb"}  # for the version
+    assert not below
+    name = module.__name__.split(".")[1]
+    if name in COMBINERS:
+        others = {n.split(".")[1] for n in ours if "." in n}
+        assert not others & (COMBINERS - {name}), "no combiner imports another"
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_signature(function):
+    parameters = inspect.signature(function).parameters.values()
+    names = [p.name for p in parameters]
+    assert all(p.kind is p.KEYWORD_ONLY for p in parameters if p.default is not p.empty)
+    assert "key" not in names[1:], "the random key comes first"
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_docstring_names_every_argument(function):
+    doc = inspect.getdoc(function)
+    assert "Returns:" in doc
+    for name in inspect.signature(function).parameters:
+        assert f"\n    {name}: " in doc, f"{name} is not described"
+
+
+@pytest.mark.parametrize(
+    "path", [*ROOT.glob("jscomb/**/*.py"), *ROOT.glob("experiments/*.py")], ids=str
+)
+def test_a_file_stays_readable(path):
+    assert len(path.read_text().splitlines()) <= 420
+
+
+def test_the_package_never_needs_what_is_beside_the_project():
+    for path in [*ROOT.glob("jscomb/**/*.py"), *ROOT.glob("tests/**/*.py")]:
+        assert "/".join(("..", "shared")) not in path.read_text(), path
+
+
+def test_version_is_said_once_more_only_in_the_metadata():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == jscomb.__version__
+    assert re.search(rf"^## {re.escape(jscomb.__version__)}\b", _changelog(), re.M)
+
+
+def _changelog() -> str:
+    """The change log's text."""
+    return (ROOT / "CHANGELOG.md").read_text()

@@ -1,0 +1,330 @@
+"""James-Stein: its definition by loops, its theorems by standard errors, its limits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb import james_stein
+from tests.statistics import assert_mean, assert_mean_below
+from tests.test_windows import near
+
+SHAPES = [(6, 5, 2), (1, 1, 1), (1, 9, 3), (12, 3, 1)]
+BOTH = pytest.mark.parametrize("whiten", [False, True])
+
+
+def finite(*images):
+    """Pixels that are finite in all images, [H,W]."""
+    return np.all([np.isfinite(i).all(axis=-1) for i in images], axis=0)
+
+
+def oracle(x, y, v, window, whiten):
+    """The definition, pixel by pixel, in NumPy float64."""
+    x, y, v = (np.asarray(i, np.float64) for i in (x, y, v))
+    valid = finite(x, y, v)
+    share = np.full_like(x, np.nan)
+    for i, j, c in np.ndindex(*x.shape):
+        if not valid[i, j]:
+            continue
+        at = near(i, j, x.shape, window)
+        members = valid[at]
+        square = (x[at] - y[at])[members, c] ** 2
+        variance = v[at][members, c]
+        if whiten:
+            counted = variance > 0
+            p, energy = counted.sum(), np.sum(square[counted] / variance[counted])
+            noise = max(p - 2, 0)
+        else:
+            p, energy = members.sum(), square.sum()
+            noise = max(p - 2, 0) * v[i, j, c]
+        lost = (1.0 if energy <= 0 else min(1.0, noise / energy)) if noise > 0 else 0.0
+        share[i, j, c] = 1 - lost
+    out = np.where(finite(y)[..., None], y, np.where(finite(x)[..., None], x, 0))
+    for i, j, c in np.ndindex(*x.shape):
+        if valid[i, j]:
+            mean = np.nanmean(share[(*near(i, j, x.shape, window), c)])
+            out[i, j, c] = y[i, j, c] + mean * (x[i, j, c] - y[i, j, c])
+    return out
+
+
+def images(shape, seed=0):
+    """x, y and a variance of several decades."""
+    x, y, v = jax.random.normal(jax.random.key(seed), (3, *shape))
+    return x, y, 0.3 * jnp.exp(v)
+
+
+@BOTH
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("window", [3, 5, 15])
+def test_matches_the_definition(shape, window, whiten):
+    data = images(shape)
+    expected = oracle(*data, window, whiten)
+    for transform in (lambda f: f, jax.jit):
+        combine = transform(
+            lambda *i: james_stein.combine(*i, window=window, whiten=whiten)
+        )
+        np.testing.assert_allclose(combine(*data), expected, rtol=1e-12, atol=1e-15)
+
+
+@BOTH
+def test_matches_the_definition_on_a_real_frame(real_frame, whiten):
+    """In float32, where radiance and variance span eight decades."""
+    frame = real_frame
+    data = frame.color, frame.biased["oidn"].full, frame.variance
+    assert data[0].dtype == jnp.float32
+    result = james_stein.combine(*data, whiten=whiten)
+    np.testing.assert_allclose(result, oracle(*data, 15, whiten), rtol=2e-5, atol=1e-7)
+
+
+# One window that holds the whole image is the theorem's own setting: p = 49.
+ONE_WINDOW = (7, 7, 1)
+REALISATIONS = 20_000
+
+
+def errors(key, bias, deviation, *, window, whiten, shape=ONE_WINDOW):
+    """Squared errors of each realisation, [n,*shape]: of x, and of the combination."""
+    truth = jnp.sin(jnp.arange(float(np.prod(shape)))).reshape(shape)
+
+    def one(key):
+        x = truth + deviation * jax.random.normal(key, shape)
+        variance = jnp.broadcast_to(deviation**2, shape)
+        y = truth + bias
+        out = james_stein.combine(x, y, variance, window=window, whiten=whiten)
+        return jnp.square(x - truth), jnp.square(out - truth)
+
+    return jax.jit(jax.vmap(one))(jax.random.split(key, REALISATIONS))
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.3, 1.0, 10.0])
+def test_dominates_the_unbiased_image(bias):
+    """Equal variances: lower risk than x whatever the bias (NJS eq. 9)."""
+    sigma = jnp.asarray(0.5)
+    x, out = errors(jax.random.key(1), bias, sigma, window=15, whiten=False)
+    assert_mean_below(jnp.sum(out - x, axis=(1, 2, 3)), 0.0)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.3, 1.0, 10.0])
+def test_whitened_dominates_under_unequal_variances(bias):
+    """Risk in units of the variance: lower than that of x whatever the bias."""
+    sigma = jnp.geomspace(0.05, 2.0, 49).reshape(ONE_WINDOW)
+    x, out = errors(jax.random.key(2), bias, sigma, window=15, whiten=True)
+    assert_mean_below(jnp.sum((out - x) / sigma[None] ** 2, axis=(1, 2, 3)), 0.0)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.3, 3.0])
+@BOTH
+def test_dominates_when_windows_overlap(bias, whiten):
+    shape, sigma = (24, 24, 1), jnp.asarray(0.5)
+    x, out = errors(
+        jax.random.key(3), bias, sigma, window=7, whiten=whiten, shape=shape
+    )
+    assert_mean_below(jnp.mean(out - x, axis=(1, 2, 3)), 0.0)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.2, 0.5, 5.0])
+def test_risk_is_unbiased(bias):
+    """Its mean is the true squared error, at every share between 0 and 1."""
+    truth, sigma = jnp.zeros(ONE_WINDOW), 0.5
+    v = jnp.full(ONE_WINDOW, sigma**2)
+
+    def excess(key):
+        x = truth + sigma * jax.random.normal(key, ONE_WINDOW)
+        out = james_stein.combine(x, truth + bias, v, window=15)
+        estimate = james_stein.risk(x, truth + bias, v, window=15)
+        return estimate[3, 3, 0] - jnp.sum(jnp.square(out - truth))
+
+    keys = jax.random.split(jax.random.key(4), REALISATIONS)
+    assert_mean(jax.jit(jax.vmap(excess))(keys), 0.0)
+
+
+def test_risk_is_equation_8_in_every_window():
+    x, y, v = images((6, 5, 2))
+    estimate = james_stein.risk(x, y, v, window=3)
+    for i, j, c in np.ndindex(*x.shape):
+        at = (*near(i, j, x.shape, 3), c)
+        p, s2 = x[at].size, float(v[i, j, c])
+        energy = float(jnp.sum(jnp.square(x[at] - y[at])))
+        expected = p * s2 - (p - 2) ** 2 * s2**2 / energy
+        if energy <= (p - 2) * s2:
+            expected = energy - p * s2
+        np.testing.assert_allclose(estimate[i, j, c], expected, rtol=1e-12)
+
+
+def test_dual_is_the_mean_of_the_crossed_halves():
+    xa, ya, v = images((6, 5, 2), 1)
+    xb, yb, _ = images((6, 5, 2), 2)
+    out = james_stein.combine_dual(xa, xb, ya, yb, v, window=3)
+    a, b = oracle(xa, yb, 2 * v, 3, False), oracle(xb, ya, 2 * v, 3, False)
+    np.testing.assert_allclose(out, (a + b) / 2, rtol=1e-12)
+
+
+def test_dual_dominates_a_denoiser_that_overfits():
+    """A y that copies its half's noise fools `combine`; crossed halves do not.
+
+    Judged against the mean of the halves, as the theorem promises for each of them.
+    """
+    shape, sigma = (21, 21, 1), 1.0
+    v = jnp.full(shape, sigma**2 / 2)
+
+    def excess(key):
+        a, b = sigma * jax.random.normal(key, (2, *shape))
+        ya, yb = 0.5 * a, 0.5 * b
+        out = james_stein.combine_dual(a, b, ya, yb, v)
+        return jnp.mean(jnp.square(out) - jnp.square((a + b) / 2))
+
+    keys = jax.random.split(jax.random.key(5), 2000)
+    assert_mean_below(jax.jit(jax.vmap(excess))(keys), 0.0)
+
+
+@BOTH
+def test_limits(whiten):
+    x, y, v = images((6, 5, 2))
+
+    combine = jax.jit(lambda *data: james_stein.combine(*data, whiten=whiten))
+    np.testing.assert_allclose(combine(x, y, 0 * v), x, rtol=1e-12)
+    np.testing.assert_array_equal(combine(x, y, 1e9 * (v + 1)), y)
+    np.testing.assert_allclose(combine(x, x, v), x, rtol=1e-15)
+    np.testing.assert_array_equal(combine(0 * x, 0 * x, 0 * v), 0 * x)
+
+
+@pytest.mark.parametrize("background", [0.0, 1e-6, 0.1])
+def test_pixels_without_variance_do_not_decide_for_their_neighbours(background):
+    """Be they a black background, or pixels whose samples all missed the light."""
+    x, y, v = (jnp.zeros((15, 30, 1)).at[:, 15:].set(k) for k in (2.0, 1.0, 0.25))
+    y = y.at[:, :15].set(background)
+    out = james_stein.combine(x, y, v, window=59, whiten=True)
+    p = 15 * 15
+    np.testing.assert_allclose(out[:, 15:], 2 - (p - 2) / (p * 4), rtol=1e-12)
+
+
+@BOTH
+def test_gradients(whiten):
+    data = images((5, 6, 2))
+    combine = jax.jit(lambda *i: james_stein.combine(*i, window=3, whiten=whiten))
+    check_grads(combine, data, order=1, modes=("fwd", "rev"), rtol=1e-4)
+    check_grads(jax.jit(james_stein.risk), data, order=1, rtol=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("image", [0, 1])
+def test_gradient_reaches_every_pixel_of_the_windows(whiten, image):
+    """The share of a window depends on all its pixels, not only on its centre."""
+    x, y, _ = images((9, 11, 1), 3)
+    data = x, y, jnp.full(x.shape, 0.1)
+
+    def centre(value):
+        replaced = [value if n == image else d for n, d in enumerate(data)]
+        out = james_stein.combine(*replaced, window=3, whiten=whiten)
+        return out[4, 5, 0]
+
+    gradient = jax.jit(jax.grad(centre))(data[image])[..., 0]
+    reached = np.zeros((9, 11), bool)
+    reached[2:7, 3:8] = True  # windows of 3x3 that overlap the centre's pixel
+    np.testing.assert_array_equal(np.asarray(gradient) != 0, reached)
+
+
+SINGULAR = {
+    "x equals y": lambda x, y, v: (x, x, v),
+    "no variance": lambda x, y, v: (x, y, 0 * v),
+    "x equals y, no variance": lambda x, y, v: (x, x, 0 * v),
+    "all black": lambda x, y, v: (0 * x, 0 * y, 0 * v),
+    "almost equal": lambda x, y, v: (x, x + 1e-12, v),
+    "firefly": lambda x, y, v: (x.at[2, 2].set(1e6), y, v.at[2, 2].set(1e12)),
+    "certain firefly": lambda x, y, v: (x.at[2, 2].set(1e6), y, v.at[2, 2].set(0)),
+    "radiance 1e-8": lambda x, y, v: (1e-8 * x, 1e-8 * y, 1e-16 * v),
+    "radiance 1e6": lambda x, y, v: (1e6 * x, 1e6 * y, 1e12 * v),
+    "tiny variance": lambda x, y, v: (x, y, 1e-30 * v),
+    "not finite": lambda x, y, v: (
+        x.at[1, 1].set(jnp.nan),
+        y.at[3, 3, 0].set(jnp.inf),
+        v.at[5, 4].set(-jnp.inf),
+    ),
+}
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("case", SINGULAR)
+@BOTH
+def test_hard_cases_stay_finite_and_right(case, precision, whiten):
+    data = [i.astype(precision) for i in SINGULAR[case](*images((8, 9, 3)))]
+
+    combine = lambda *i: james_stein.combine(*i, window=5, whiten=whiten)
+    out = jax.jit(combine)(*data)
+    expected = oracle(*data, 5, whiten)
+    scale = np.nanmax(np.abs(np.where(np.isfinite(data[1]), data[1], 0)), initial=0)
+    tolerance = 2e-5 if precision == "float32" else 1e-7
+    np.testing.assert_allclose(out, expected, rtol=tolerance, atol=tolerance * scale)
+    risk = lambda *i: james_stein.risk(*i, window=5)
+    total = lambda *i: combine(*i).sum() + risk(*i).sum()
+    gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(*data)
+    assert all(np.isfinite(g).all() for g in gradients)
+
+
+@BOTH
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("image", [0, 1, 2])
+def test_a_pixel_that_is_not_finite_stays_local(bad, image, whiten):
+    """It is the first finite of (y, x, 0), and to others as if it were not there."""
+    data = list(images((8, 9, 3)))
+    poisoned = data.copy()
+    poisoned[image] = data[image].at[3, 4, 1].set(bad)
+    out = james_stein.combine(*poisoned, window=5, whiten=whiten)
+    np.testing.assert_allclose(out, oracle(*poisoned, 5, whiten), rtol=1e-12)
+    assert np.isfinite(out).all()
+    np.testing.assert_array_equal(out[3, 4], data[0 if image == 1 else 1][3, 4])
+    clean = james_stein.combine(*data, window=5, whiten=whiten)
+    far = np.ones((8, 9), bool)
+    far[: 3 + 5, 4 - 4 : 4 + 5] = False
+    np.testing.assert_array_equal(out[far], clean[far])
+
+
+def test_all_pixels_invalid():
+    nothing = jnp.full((3, 3, 1), jnp.nan)
+    out = james_stein.combine(nothing, nothing, nothing)
+    np.testing.assert_array_equal(out, 0.0)
+    np.testing.assert_array_equal(james_stein.risk(nothing, nothing, nothing), 0.0)
+
+
+def test_smooth_variance_kinds():
+    v = images((6, 7, 2))[2]
+    box = james_stein.smooth_variance(v, window=3)
+    given = james_stein.smooth_variance(v, window=3, weights=jnp.full((6, 7, 9), 2.0))
+    wide = james_stein.smooth_variance(v, window=3, sigma=1e6)
+    np.testing.assert_allclose(given, box, rtol=1e-12)
+    np.testing.assert_allclose(wide, box, rtol=1e-9)
+    np.testing.assert_allclose(box[0, 0], v[:2, :2].mean((0, 1)), rtol=1e-12)
+    narrow = james_stein.smooth_variance(v, window=3, sigma=0.05)
+    np.testing.assert_allclose(narrow, v, rtol=1e-12)
+    hole = james_stein.smooth_variance(v.at[2, 2].set(jnp.nan), window=3)
+    assert np.isfinite(hole).all()
+
+
+def test_robust_variance_only_raises():
+    v = images((9, 8, 2))[2].at[4, 4].set(0).at[2, 3].set(1e12).at[0, 0].set(jnp.nan)
+    robust = james_stein.robust_variance(v)
+    finite_pixels = np.isfinite(v)
+    assert (robust >= v)[finite_pixels].all()
+    assert robust[4, 4].min() > 0
+    np.testing.assert_array_equal(robust[2, 3], v[2, 3])
+    np.testing.assert_array_equal(np.isfinite(robust), finite_pixels)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_rejects_bad_input():
+    x, y, v = images((6, 5, 2))
+    combine = james_stein.combine
+    with pytest.raises(ValueError, match=r"biased has shape .*5, 5, 2.*, unbiased"):
+        combine(x, y[:5], v)
+    with pytest.raises(ValueError, match="variance has shape"):
+        jax.jit(combine)(x, y, v[..., :1])
+    with pytest.raises(ValueError, match=r"unbiased must have shape \[H, W, C\]"):
+        combine(x[0], y[0], v[0])
+    with pytest.raises(ValueError, match=r"at least one pixel; got \(0, 5, 2\)"):
+        combine(x[:0], y[:0], v[:0])
+    with pytest.raises(ValueError, match="window must be at least three"):
+        jax.jit(lambda *i: combine(*i, window=1))(x, y, v)
+    with pytest.raises(ValueError, match="window must be odd"):
+        james_stein.risk(x, y, v, window=4)
+    with pytest.raises(ValueError, match="not both"):
+        james_stein.smooth_variance(v, sigma=1.0, weights=jnp.ones((6, 5, 225)))

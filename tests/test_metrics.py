@@ -1,0 +1,147 @@
+"""Errors against their definitions, their invariances, and FLIP's guard."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb import metrics
+from tests.statistics import assert_mean
+from tests.test_windows import near
+
+PURE = [metrics.rel_l2, metrics.rmse, metrics.smape, metrics.dssim]
+
+
+@pytest.fixture
+def pair():
+    """An image and its reference, linear radiance up to about 10."""
+    r = jnp.exp(jax.random.normal(jax.random.key(0), (13, 9, 3)))
+    return r * (1 + 0.1 * jax.random.normal(jax.random.key(1), r.shape)), r
+
+
+def test_definitions(pair):
+    a, r = map(np.asarray, pair)
+    d = a - r
+    grey = r.mean(-1, keepdims=True)
+    expected = [
+        np.mean(d**2 / (grey**2 + 0.01)),
+        np.sqrt(np.mean(d**2)),
+        np.mean(np.abs(d) / (np.abs(a) + np.abs(r) + 0.001)),
+        np.mean((1 - ssim_loops(a, r)) / 2),
+    ]
+    for metric, value in zip(PURE, expected, strict=True):
+        np.testing.assert_allclose(metric(*pair), value, rtol=1e-9)
+
+
+def ssim_loops(a, r):
+    """Structural similarity of the tone-mapped images, window by window."""
+    a, r = (np.asarray(metrics.tone_map(jnp.asarray(i))) for i in (a, r))
+    out = np.empty_like(a)
+    for y, x, c in np.ndindex(*a.shape):
+        rows, columns = near(y, x, a.shape, 11)
+        dy, dx = np.mgrid[rows, columns]
+        w = np.exp(-((dy - y) ** 2 + (dx - x) ** 2) / (2 * 1.5**2))
+        w /= w.sum()
+        p, q = a[rows, columns, c], r[rows, columns, c]
+        mp, mq = (w * p).sum(), (w * q).sum()
+        vp, vq = (w * (p - mp) ** 2).sum(), (w * (q - mq) ** 2).sum()
+        cov = (w * (p - mp) * (q - mq)).sum()
+        out[y, x, c] = (2 * mp * mq + 1e-4) * (2 * cov + 9e-4)
+        out[y, x, c] /= (mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)
+    return out
+
+
+@pytest.mark.parametrize("metric", PURE)
+def test_zero_for_equal_images_with_finite_gradient(metric, pair):
+    _, r = pair
+    np.testing.assert_allclose(metric(r, r), 0, atol=1e-15)
+    gradient = jax.jit(jax.grad(metric))
+    assert np.isfinite(gradient(r, r)).all()
+    black = jnp.zeros_like(r)
+    assert np.isfinite(gradient(black, black)).all()
+
+
+@pytest.mark.parametrize("metric", PURE)
+def test_gradients_and_transforms(metric, pair):
+    check_grads(jax.jit(metric), pair, order=1, modes=("rev",), rtol=1e-4)
+    batch = [jnp.stack([i, 2 * i]) for i in pair]
+    np.testing.assert_allclose(
+        jax.vmap(metric)(*batch), [metric(a, r) for a, r in zip(*batch, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("metric", PURE)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_pixel_that_is_not_finite_is_never_hidden(metric, pair, value):
+    a, r = pair
+    bad = a.at[2, 3, 1].set(value)
+    assert not np.isfinite(metric(bad, r))
+    assert not np.isfinite(metric(r, bad))
+    mask = jnp.isfinite(bad).all(-1, keepdims=True)
+    masked = metric(bad, r, mask=mask)
+    assert np.isfinite(masked)
+    np.testing.assert_array_equal(masked, metric(a.at[2, 3].set(1e6), r, mask=mask))
+    gradient = jax.jit(jax.grad(lambda *i: metric(*i, mask=mask), argnums=(0, 1)))
+    assert np.isfinite(gradient(bad, r)).all()
+    np.testing.assert_array_equal(gradient(bad, r)[0][2, 3], 0)
+    nothing = jnp.zeros_like(mask)
+    assert np.isnan(metric(a, r, mask=nothing))
+
+
+def test_relative_l2_less_the_references_noise_is_unbiased():
+    """A noisy reference raises the error by its own variance, no more."""
+    truth, sigma = jnp.full((8, 8, 3), 2.0), 0.2
+    image = truth + 0.1
+
+    def corrected(key):
+        a, b = truth[None] + sigma * jax.random.normal(key, (2, *truth.shape))
+        # The weight is taken at the noisy reference; a large epsilon keeps it fixed.
+        return metrics.rel_l2(image, (a + b) / 2, epsilon=1e8, half_difference=a - b)
+
+    values = jax.vmap(corrected)(jax.random.split(jax.random.key(0), 4000))
+    assert_mean(values * 1e8, 0.01)
+
+
+def test_tone_map_is_monotone_and_finite():
+    x = jnp.concatenate([jnp.array([-1.0, 0.0]), jnp.geomspace(1e-8, 1e30, 200)])
+    for dtype in ("float32", "float64"):
+        y = metrics.tone_map(x.astype(dtype))
+        assert (jnp.diff(y) >= 0).all()
+        assert (y[0], y[1]) == (0, 0)
+        np.testing.assert_allclose(y[-1], 1, rtol=1e-6)
+        assert np.isfinite(jax.grad(lambda x: metrics.tone_map(x).sum())(x)).all()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_shapes_are_named(pair):
+    a, r = pair
+    for metric in PURE:
+        with pytest.raises(ValueError, match="reference has shape"):
+            metric(a, r[:-1])
+    with pytest.raises(ValueError, match="half_difference has shape"):
+        metrics.rel_l2(a, r, half_difference=r[:-1])
+
+
+def test_flip(glass_frame):
+    image, reference = glass_frame.biased["oidn"].full, glass_frame.reference.image
+    for flip in (metrics.flip, metrics.hdr_flip):
+        better, worse = flip(image, reference), flip(glass_frame.color, reference)
+        assert 0 < better < worse < 1
+    assert metrics.flip(reference, reference) < 1e-6
+
+
+def test_flip_is_guarded(pair):
+    """Each of these ends the evaluator's process, or passes as perfect."""
+    a, r = pair
+    black = jnp.zeros_like(r)
+    for flip in (metrics.flip, metrics.hdr_flip):
+        with pytest.raises(ValueError, match="reference must have pixels and be fin"):
+            flip(a, r.at[0, 0, 0].set(jnp.inf))
+        with pytest.raises(ValueError, match="image must have pixels and be finite"):
+            flip(a[:0], r[:0])
+        with pytest.raises(ValueError, match=r"must be \[H,W,3\]"):
+            flip(a, r[:-1])
+    with pytest.raises(ValueError, match="reference is all black"):
+        metrics.hdr_flip(a, black)
+    assert 0 <= metrics.flip(a, black) <= 1

@@ -1,0 +1,85 @@
+"""Open Image Denoise behind its guard: real filter, real frames, ugly pixels."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jscomb import metrics
+from jscomb.denoisers import oidn
+from jscomb.frame import make_frame
+
+
+@pytest.fixture(scope="module")
+def denoised(glass_frame):
+    return oidn.denoise_frame(glass_frame)
+
+
+def test_lowers_the_error_of_frame_and_halves(glass_frame, denoised):
+    frame, reference = glass_frame, glass_frame.reference.image
+    error = metrics.rel_l2
+    assert error(denoised.full, reference) < 0.3 * error(frame.color, reference)
+    for half, image in zip(frame.halves(), denoised.halves, strict=True):
+        assert error(image, reference) < 0.3 * error(half.color, reference)
+
+
+def test_features_are_used(glass_frame, denoised):
+    """Each changes the result; that it gets better is not promised."""
+    without = oidn.denoise_frame(glass_frame, features=False).full
+    only_albedo = oidn.denoise(glass_frame.color, albedo=glass_frame.albedo)
+    assert jnp.abs(only_albedo - without).max() > 1e-3
+    assert jnp.abs(denoised.full - only_albedo).max() > 1e-3
+
+
+def test_frame_without_sub_buffers(glass_frame):
+    plain = make_frame(glass_frame.color)
+    assert oidn.denoise_frame(plain).halves is None
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e-4, 1e6])
+def test_scale_equivariant(glass_frame, denoised, scale):
+    """The bare filter is not, at radiance 1e-8."""
+    scaled = oidn.denoise_frame(glass_frame.scaled(jnp.float32(scale)))
+    np.testing.assert_allclose(scaled.full, scale * denoised.full, rtol=1e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_bad_pixel_stays_local(glass_frame, denoised, bad):
+    """The bare filter spreads an infinite pixel over a third of the image."""
+    color = glass_frame.color.at[30, 30, 0].set(bad)
+    image = oidn.denoise(
+        color,
+        albedo=glass_frame.albedo,
+        normal=glass_frame.normal,
+        exposure=glass_frame.exposure,
+    )
+    assert np.isfinite(image).all()
+    far = np.ones((64, 64), bool)
+    far[20:41, 20:41] = False
+    np.testing.assert_allclose(image[far], denoised.full[far], rtol=0.1, atol=1e-3)
+
+
+def test_nothing_finite_and_nothing_lit(glass_frame):
+    black = jnp.zeros_like(glass_frame.color)
+    for image in (black, black * jnp.nan):
+        np.testing.assert_allclose(oidn.denoise(image), 0, atol=1e-4)
+
+
+def test_holes_are_filled_from_near_to_far():
+    image = jnp.ones((9, 9, 3)).at[:, 5:].set(3.0).at[2:7, 2:7].set(jnp.nan)
+    filled = oidn._fill(image)
+    assert ((filled >= 1) & (filled <= 3)).all()
+    np.testing.assert_allclose(filled[3, 2], 1)
+    np.testing.assert_allclose(filled[3, 6], 3)
+
+
+def test_rejects_bad_input(glass_frame, monkeypatch):
+    color = glass_frame.color
+    with pytest.raises(ValueError, match=r"color must have shape \[H,W,3\]"):
+        oidn.denoise(color[..., :1])
+    with pytest.raises(ValueError, match="albedo has shape"):
+        oidn.denoise(color, albedo=color[1:])
+    with pytest.raises(ValueError, match="normal needs albedo"):
+        oidn.denoise(color, normal=color)
+    monkeypatch.setattr(oidn, "available", lambda: False)
+    with pytest.raises(ImportError, match=r'pip install "jscomb\[oidn\]"'):
+        oidn.denoise(color)

@@ -1,0 +1,202 @@
+"""Window sums, means and extrema against loops; locality, clipping, masks."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb.numerics import windows
+
+SHAPES = [(1, 1, 1), (1, 7, 2), (6, 1, 1), (5, 8, 3), (20, 9, 1)]
+WINDOWS = [1, 3, 5, 7, 15, 21]
+
+
+def near(y, x, shape, window):
+    """Slices of the clipped window of a pixel."""
+    r = window // 2
+    rows = slice(max(0, y - r), min(shape[0], y + r + 1))
+    return rows, slice(max(0, x - r), min(shape[1], x + r + 1))
+
+
+def loop(image, window, fold):
+    """`fold` over the clipped window of every pixel, in NumPy."""
+    out = np.empty_like(image)
+    for y, x, c in np.ndindex(*image.shape):
+        out[y, x, c] = fold(image[(*near(y, x, image.shape, window), c)])
+    return out
+
+
+def images(shape, seed=0):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize(
+    ("function", "fold"),
+    [
+        (windows.window_sum, np.sum),
+        (windows.window_mean, np.mean),
+        (windows.window_min, np.min),
+        (windows.window_max, np.max),
+    ],
+)
+def test_matches_loops(shape, window, function, fold):
+    image = images(shape)
+    np.testing.assert_allclose(
+        function(jnp.asarray(image), window),
+        loop(image, window, fold),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("window", WINDOWS)
+def test_count_is_the_sum_of_ones(shape, window):
+    np.testing.assert_array_equal(
+        windows.window_count(shape, window, dtype=jnp.float64),
+        windows.window_sum(jnp.ones((*shape[:2], 1)), window),
+    )
+
+
+@pytest.mark.parametrize("window", [3, 15])
+def test_masked_pixels_take_no_part(window):
+    image = images((6, 7, 2))
+    mask = np.random.default_rng(1).random((6, 7, 1)) < 0.6
+    mask[:3, :3] = False  # a window without any pixel
+    hidden = jnp.asarray(np.where(mask, image, np.nan))
+    kept = np.where(mask, image, 0)
+    count = loop(np.broadcast_to(mask, image.shape).astype(float), window, np.sum)
+    total = loop(kept, window, np.sum)
+    np.testing.assert_allclose(
+        windows.window_sum(hidden, window, mask=jnp.asarray(mask)), total, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        windows.window_mean(hidden, window, mask=jnp.asarray(mask)),
+        np.divide(total, count, out=np.zeros_like(total), where=count > 0),
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(
+        windows.window_max(hidden, window, mask=jnp.asarray(mask)),
+        loop(np.where(mask, image, -np.inf), window, np.max),
+    )
+    np.testing.assert_array_equal(
+        windows.window_min(hidden, window, mask=jnp.asarray(mask)),
+        loop(np.where(mask, image, np.inf), window, np.min),
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gaussian_mean_matches_loops(shape):
+    image, window, sigma = images(shape), 7, 1.3
+    out = np.empty_like(image)
+    for y, x, c in np.ndindex(*shape):
+        rows, columns = near(y, x, shape, window)
+        dy, dx = np.mgrid[rows, columns]
+        weight = np.exp(-((dy - y) ** 2 + (dx - x) ** 2) / (2 * sigma**2))
+        out[y, x, c] = np.average(image[rows, columns, c], weights=weight)
+    np.testing.assert_allclose(
+        windows.window_mean(jnp.asarray(image), window, sigma=sigma), out, rtol=1e-10
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_weighted_mean_matches_loops(shape):
+    window, r = 5, 2
+    image = images(shape)
+    weights = np.random.default_rng(2).random((*shape[:2], window**2))
+    out = np.empty_like(image)
+    for y, x, c in np.ndindex(*shape):
+        total = weight = 0.0
+        for k, (dy, dx) in enumerate(np.ndindex(window, window)):
+            v, u = y + dy - r, x + dx - r
+            if 0 <= v < shape[0] and 0 <= u < shape[1]:
+                total += weights[y, x, k] * image[v, u, c]
+                weight += weights[y, x, k]
+        out[y, x, c] = total / weight
+    result = windows.weighted_mean(jnp.asarray(image), jnp.asarray(weights), window)
+    np.testing.assert_allclose(result, out, rtol=1e-10)
+    check_grads(
+        jax.jit(lambda i, w: windows.weighted_mean(i, w, window)),
+        (jnp.asarray(image), jnp.asarray(weights)),
+        order=1,
+        rtol=1e-4,
+    )
+
+
+def test_a_firefly_leaves_other_windows_exact():
+    """Running differences would lose the digits of everything after it."""
+    image = np.full((9, 64, 1), 1e-3, np.float32)
+    image[4, 8] = 1e6
+    total = windows.window_sum(jnp.asarray(image), 5)
+    np.testing.assert_allclose(total[4, 16:-2], 25e-3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "function", [windows.window_sum, windows.window_mean, windows.window_max]
+)
+def test_transforms_agree(function):
+    batch = jnp.asarray(images((3, 6, 5, 2)))
+    eager = jnp.stack([function(i, 3) for i in batch])
+    mapped = jax.jit(jax.vmap(lambda i: function(i, 3)))(batch)
+    np.testing.assert_allclose(mapped, eager, rtol=1e-12, atol=1e-14)
+    check_grads(jax.jit(lambda i: function(i, 3)), (batch[0],), order=1, rtol=1e-5)
+
+
+SHARDED = """
+import re
+import os
+import subprocess
+import sys
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jscomb.numerics.windows import window_max, window_sum
+
+rows = NamedSharding(Mesh(jax.devices(), "rows"), PartitionSpec("rows"))
+for function in (window_sum, window_max):
+    compiled = jax.jit(lambda i: function(i, 15), in_shardings=rows, out_shardings=rows)
+    image = jax.ShapeDtypeStruct((256, 64, 3), "float32")
+    text = compiled.lower(image).compile().as_text()
+    moves = re.findall(r"(collective-permute|all-\\w+)(?:-start)?\\(", text)
+    assert moves == 2 * ["collective-permute"], moves
+print(len(jax.devices()))
+"""
+
+
+def test_sharded_by_rows_it_is_one_exchange_of_halos():
+    """Compiled for four devices, in a process that believes it has them."""
+    flags = "--xla_force_host_platform_device_count=4"
+    done = subprocess.run(
+        [sys.executable, "-c", SHARDED],
+        env=os.environ | {"XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "4\n", done.stderr
+
+
+@pytest.mark.parametrize("window", [0, -1, 2, 14])
+def test_rejects_even_and_empty_windows(window):
+    image = jnp.ones((3, 3, 1))
+    for function in (windows.window_sum, windows.window_mean, windows.window_min):
+        with pytest.raises(ValueError, match="window must be odd and positive"):
+            function(image, window)
+    with pytest.raises(ValueError, match="window must be odd and positive"):
+        windows.window_count((3, 3), window)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_rejects_bad_weights():
+    image = jnp.ones((3, 4, 1))
+    with pytest.raises(ValueError, match=r"weights must have shape \(3, 4, 25\)"):
+        windows.weighted_mean(image, jnp.ones((3, 4, 9)), 5)
+    with pytest.raises(ValueError, match="sigma must be positive"):
+        windows.window_mean(image, 3, sigma=0.0)
