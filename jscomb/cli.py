@@ -215,6 +215,9 @@ def main() -> None:
     _use_compilation_cache()
     try:
         _parse()()
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
         print("jscomb:", " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)

@@ -287,7 +287,7 @@ def _sum_and_count(
 
 
 def _borrowed(count: Image) -> Image:
-    """P - 2, the dimensions that shrinkage gains from; none below three pixels."""
+    """The p - 2 dimensions that shrinkage gains from; none below three pixels."""
     return jnp.maximum(count - 2, 0.0)
 
 

@@ -252,6 +252,13 @@ def test_sizes_must_agree(jscomb, tmp_path):
         assert re.search(r"small\.exr is \(9, 9, 3\)", error)
 
 
+def test_a_reader_that_stops_early_is_no_error():
+    command = f"{sys.executable} -m jscomb info {GLASS} | head -n 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert done.stdout == f"{GLASS}: jscomb\n"
+    assert done.stderr == ""
+
+
 def test_from_the_shell(tmp_path):
     """As a process: exit status, streams, no traceback."""
     done = subprocess.run(
