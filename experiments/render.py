@@ -239,6 +239,7 @@ def _borrowed(path: pathlib.Path) -> Reference:
 
 def _visibility(mi):
     """An integrator: the unoccluded fraction of emitter samples at the first hit."""
+    import drjit as dr  # comes with Mitsuba
 
     class Visibility(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -248,8 +249,10 @@ def _visibility(mi):
                 si, sampler.next_2d(lit), False, lit
             )
             lit &= light.pdf > 0
-            lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
-            return mi.Color3f(mi.Float(lit)), active, []
+            occluded = scene.ray_test(si.spawn_ray_to(light.p), lit)
+            # `select`, since in scalar variants these are Python's own booleans.
+            seen = dr.select(lit, dr.select(occluded, 0.0, 1.0), 0.0)
+            return mi.Color3f(seen), active, []
 
     return Visibility(mi.Properties())
 
