@@ -3,20 +3,22 @@
     python -m experiments.james_stein_error FOLDER
 
 Every archive in the folder (see `frames`), at every sample count: relative L2, less the
-reference's noise, of path tracing, of Open Image Denoise, and of each combiner; then
-the geometric mean over the frames of the ratio to the better of the two inputs.
+reference's noise, of path tracing, of Open Image Denoise, and of each combiner (`auto`
+combines only where the half buffers say that it helps); then the geometric mean over
+the frames of the ratio to the better of the two inputs.
 """
 
 import dataclasses
 import pathlib
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from experiments import frames
 from jscomb import james_stein
-from jscomb.cli import METHODS
+from jscomb.cli import METHODS, estimated_change
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
@@ -52,7 +54,10 @@ def images_of(frame: Frame) -> dict[str, Image]:
     combined = {
         name: method(frame.color, y, frame.variance) for name, method in METHODS.items()
     }
-    return {"path tracing": frame.color, "oidn": y, **combined, "dual": _dual(frame)}
+    change = estimated_change(frame, frame.biased["oidn"], "whitened")
+    chosen = jnp.where(change.helps, combined["whitened"], y)
+    inputs = {"path tracing": frame.color, "oidn": y}
+    return inputs | combined | {"auto": chosen, "dual": _dual(frame)}
 
 
 def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
@@ -80,7 +85,7 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
             images = jax.jit(images_of)(frame)  # comes back sorted by name
             found[path.stem, samples] = {
                 name: float(rel_l2(images[name], r, half_difference=noise))
-                for name in (*INPUTS, *METHODS, "dual")
+                for name in (*INPUTS, *METHODS, "auto", "dual")
             }
     return found
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -24,7 +25,7 @@ import jscomb
 from jscomb import exr, james_stein, metrics
 from jscomb.denoisers import oidn
 from jscomb.exr import dialects
-from jscomb.frame import Frame, Reference
+from jscomb.frame import Biased, Frame, Reference
 from jscomb.numerics.guards import finite
 from jscomb.typing import Image, Variance
 
@@ -32,7 +33,7 @@ Path = pathlib.Path
 _Frame = tyro.conf.Positional[Path]
 _Samples = Annotated[int | None, tyro.conf.arg(metavar="N")]
 _Biased = Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")]
-_Method = Literal["whitened", "james-stein"]
+_Method = Literal["auto", "whitened", "james-stein"]
 TIMED_RUNS = 7
 _DEMO_FOLDER = Path("jscomb-demo")
 
@@ -52,6 +53,33 @@ METHODS: dict[str, Callable[[Image, Image, Variance], Image]] = {
     "james-stein": _james_stein,
     "whitened": _whitened,
 }
+KEEP = "kept"  # what `auto` does with a biased image that it cannot better
+
+
+def estimated_change(frame: Frame, biased: Biased, method: str) -> metrics.Change:
+    """Relative L2 that a method would add to a biased image, from half buffers alone.
+
+    Args:
+        frame: with sub-buffers, and halves of the biased image.
+        biased: the biased image with its halves.
+        method: a key of `METHODS`.
+
+    Returns:
+        the change, scale-invariant.
+
+    Raises:
+        ValueError: if the frame or the biased image has no halves.
+    """
+    halves = frame.halves()
+    y = biased.halves
+    if y is None:
+        raise ValueError("the biased image was not made from each half too")
+    x = jnp.stack([half.color for half in halves])
+    z = jnp.stack(
+        [METHODS[method](h.color, y[n], h.variance) for n, h in enumerate(halves)]
+    )
+    # Relative to the frame: pixels darker than is typical of it do not decide.
+    return metrics.rel_l2_change(z, y, x, epsilon=jnp.square(frame.exposure))
 
 
 def demo(*, out: Path = _DEMO_FOLDER) -> None:
@@ -101,7 +129,7 @@ def combine(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     *,
     biased: _Biased = None,
-    method: _Method = "whitened",
+    method: _Method = "auto",
     samples: _Samples = None,
 ) -> None:
     """Combine a path-traced frame with a biased image into one better image.
@@ -111,8 +139,9 @@ def combine(
         out: EXR file to write.
         biased: EXR file of the biased image, or its name within the frame. By default
             the frame's only one; a frame without any is denoised by Open Image Denoise.
-        method: whitened (better with most denoisers), or james-stein as in the paper
-            without its network.
+        method: whitened, or james-stein as in the paper without its network; auto is
+            whitened, unless the half buffers say that it would raise the error: then
+            the biased image is kept.
         samples: samples a pixel, where the file does not say.
     """
     path, loaded = frame, exr.read_frame(frame, samples=samples)
@@ -121,18 +150,21 @@ def combine(
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     name, image = _biased_image(path, loaded, biased)
-    combined = jax.jit(METHODS[method])(loaded.color, image, variance)
+    chosen = _choose(loaded, image) if method == "auto" else method
+    combined = image.full
+    if chosen != KEEP:
+        combined = jax.jit(METHODS[chosen])(loaded.color, image.full, variance)
     about = {
         "jscomb": jscomb.__version__,
-        "method": method,
+        "method": chosen,
         "frame": path.name,
         "biased": name,
         "input": exr.read_provenance(path) if path.is_file() else {},
     }
     exr.write_image(out, combined, provenance=about)
-    print(f"wrote {out}: {_size(loaded)}, {method} with {name}")
+    print(f"wrote {out}: {_size(loaded)}, {name} {chosen}")
     if loaded.reference is not None:
-        images = {"input": loaded.color, name: image, method: combined}
+        images = {"input": loaded.color, name: image.full, chosen: combined}
         _print_table({"relative L2": _errors(images, loaded)})
 
 
@@ -263,11 +295,23 @@ def _bundled() -> list[Path]:
     return [Path(str(f)) for f in folder.iterdir() if f.name.endswith(".exr")]
 
 
-def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Image]:
+def _choose(frame: Frame, biased: Biased) -> str:
+    """A method where the half buffers say that it helps, else to keep the image."""
+    if frame.sub_buffers < 2 or biased.halves is None:
+        print("without half buffers of both images it is not known whether this helps")
+        return "whitened"
+    estimate = jax.jit(estimated_change, static_argnames="method")
+    change = estimate(frame, biased, method="whitened")
+    mean, error = map(float, change)
+    print(f"by the half buffers, whitened adds {mean:+.2g} +- {error:.1g} relative L2")
+    return "whitened" if change.helps else KEEP
+
+
+def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Biased]:
     """Name and image of what to combine with."""
     held = ", ".join(frame.biased) or "none"
     if choice in frame.biased:
-        return choice, frame.biased[choice].full
+        return choice, frame.biased[choice]
     if choice is not None:
         if not os.path.exists(choice):
             raise ValueError(
@@ -277,17 +321,17 @@ def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Im
         image = exr.read_image(choice)
         if image.shape != frame.color.shape:
             raise ValueError(f"{choice} is {image.shape}, {path} {frame.color.shape}")
-        return Path(choice).name, image
+        return Path(choice).name, Biased(image)
     if len(frame.biased) > 1:
         raise ValueError(f"{path} holds several biased images, choose --biased: {held}")
     for name, image in frame.biased.items():
-        return name, image.full
+        return name, image
     if not oidn.available():
         raise ImportError(
             f"{path} holds no biased image: give --biased FILE, or pip install "
             '"jscomb[oidn]" to denoise it here'
         )
-    return "oidn", oidn.denoise_frame(frame).full
+    return "oidn", oidn.denoise_frame(frame)
 
 
 def _timed(function: Callable, *inputs: Image) -> tuple[Image, float]:

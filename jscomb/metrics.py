@@ -14,12 +14,13 @@ import importlib.util
 import io
 import subprocess
 import sys
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jscomb.numerics.guards import check_same_shape, divide
+from jscomb.numerics.guards import check_same_shape, divide, finite
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Mask, Scalar
 
@@ -66,6 +67,71 @@ def rel_l2(
         check_same_shape(reference=reference, half_difference=half_difference)
         square = square - jnp.square(_masked(mask, half_difference)) / 4
     return _mean(square / weight, mask)
+
+
+class Change(NamedTuple):
+    """An estimated change of an error, and how far to trust it.
+
+    Attributes:
+        mean: the estimate, shape []; negative where the error falls.
+        standard_error: of the estimate over the frame's pixels, shape [].
+    """
+
+    mean: Scalar
+    standard_error: Scalar
+
+    @property
+    def helps(self) -> Bool[Array, ""]:
+        """Whether the error falls by more than the standard error."""
+        return self.mean + self.standard_error < 0
+
+
+def rel_l2_change(
+    candidates: Float[Array, "2 h w c"],
+    baselines: Float[Array, "2 h w c"],
+    unbiased: Float[Array, "2 h w c"],
+    *,
+    epsilon: Scalar | float = 0.01,
+) -> Change:
+    """Estimate from half buffers, without a reference, what a change does to the error.
+
+    With z the candidate, y the baseline and x the unbiased image of independent halves,
+
+        (z_a - x_b)^2 - (y_a - x_b)^2 = (z_a - y_a) (z_a + y_a - 2 x_b),
+
+    whose expectation over x_b is the difference of the true squared errors: the noise
+    of x_b cancels. Both directions, averaged over the whole frame; a single pixel's
+    value is far too noisy to decide anything.
+
+    Args:
+        candidates: z made from each half, linear radiance, shape [2,H,W,C].
+        baselines: y made from each half, likewise.
+        unbiased: x of each half, likewise.
+        epsilon: squared radiance that keeps black pixels from deciding, as in `rel_l2`.
+
+    Returns:
+        relative L2 of the candidates less that of the baselines, relative to the
+        baselines' radiance. Unbiased, for images made from one half. The standard error
+        takes pixels as independent, and the spread of the true change over the frame
+        for noise, so it is rather too large. Pixels that are not finite are left out;
+        NaN if none is left.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+    """
+    means, errors = [], []
+    for half in (0, 1):
+        z, y, x = candidates[half], baselines[half], unbiased[1 - half]
+        check_same_shape(unbiased=x, candidates=z, baselines=y)
+        mask = finite(z, y, x)
+        z, y, x = (_masked(mask, image) for image in (z, y, x))
+        weight = jnp.square(jnp.mean(y, axis=-1, keepdims=True)) + epsilon
+        change = jnp.mean((z - y) * (z + y - 2 * x) / weight, axis=-1, keepdims=True)
+        mean = _mean(change, mask)
+        spread = _mean(jnp.square(change - mean), mask)
+        means.append(mean)
+        errors.append(jnp.sqrt(spread / jnp.sum(mask).astype(mean.dtype)))
+    return Change((means[0] + means[1]) / 2, jnp.hypot(*errors) / 2)
 
 
 def rmse(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jscomb import cli, exr, metrics
+from jscomb.frame import Biased
 from jscomb.numerics.guards import finite
 from tests.conftest import DATA
 from tests.test_exr import layer, noise, write
@@ -53,10 +54,13 @@ def test_demo(jscomb, tmp_path):
     assert os.fspath((tmp_path / "demo").resolve()) in out
 
 
-@pytest.mark.parametrize("method", ["james-stein", "whitened"])
+@pytest.mark.parametrize("method", ["auto", "james-stein", "whitened"])
 def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     path = tmp_path / "out.exr"
     status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)
+    if method == "auto":
+        method = "whitened"
+        assert re.search(r"half buffers: whitened adds -0\.\d+ \+- 0\.\d+ rel", out)
     assert status == 0
     image = exr.read_image(path)
     r, noise = glass_frame.reference
@@ -67,6 +71,20 @@ def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     assert about["input"]["scene"] == "cornell-glass"
 
 
+def test_combine_keeps_what_it_cannot_better(jscomb, tmp_path, glass_frame):
+    """A biased image that is the truth can only be harmed, and the halves tell."""
+    truth = glass_frame.reference.image
+    frame = glass_frame._replace(biased={})
+    perfect = frame.with_biased("perfect", Biased(truth, np.stack([truth, truth])))
+    exr.write_frame(tmp_path / "f.exr", perfect)
+    status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
+    assert status == 0
+    assert re.search(r"half buffers: whitened adds \+", out)
+    assert "perfect kept" in out
+    np.testing.assert_array_equal(exr.read_image(tmp_path / "o.exr"), truth)
+    assert exr.read_provenance(tmp_path / "o.exr")["method"] == "kept"
+
+
 def test_combine_with_a_file(jscomb, tmp_path, glass_frame):
     biased = tmp_path / "flat.exr"
     exr.write_image(biased, np.zeros((64, 64, 3)))
@@ -74,7 +92,8 @@ def test_combine_with_a_file(jscomb, tmp_path, glass_frame):
         "combine", GLASS, "--biased", biased, "--out", tmp_path / "out.exr"
     )
     assert status == 0
-    assert "with flat.exr" in out
+    assert "flat.exr whitened" in out
+    assert "it is not known whether this helps" in out
     named = jscomb("combine", GLASS, "--biased", "oidn", "-o", tmp_path / "named.exr")
     assert named[0] == 0
 
@@ -91,7 +110,7 @@ def test_combine_denoises_what_is_not(jscomb, tmp_path, glass_frame):
     frame = write(tmp_path / "pbrt.exr", channels, samplesPerPixel=64)
     status, out, _ = jscomb("combine", frame, "-o", tmp_path / "out.exr")
     assert status == 0
-    assert "with oidn" in out
+    assert "oidn whitened" in out
     r, noise = f.reference
     status, out, _ = jscomb("compare", tmp_path / "out.exr", GLASS)
     expected = float(
@@ -185,7 +204,7 @@ def test_help_reads_well(jscomb):
         assert status == 0
         assert "usage: jscomb" in out
         assert "{None}" not in out
-    assert "{whitened,james-stein}" in jscomb("combine", "--help")[1]
+    assert "{auto,whitened,james-stein}" in jscomb("combine", "--help")[1]
 
 
 def truncated(folder):

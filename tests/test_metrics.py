@@ -103,6 +103,40 @@ def test_relative_l2_less_the_references_noise_is_unbiased():
     assert_mean(values * 1e8, 0.01)
 
 
+def test_a_change_is_known_without_a_reference():
+    """Unbiased for the true change, whichever of the two is better."""
+    truth = jnp.sin(jnp.arange(192.0)).reshape(8, 8, 3) + 2
+    for z_error, y_error in ((0.1, 0.3), (0.3, 0.1)):
+
+        def excess(key, z_error=z_error, y_error=y_error):
+            x = truth[None] + 0.5 * jax.random.normal(key, (2, *truth.shape))
+            y = truth[None] + y_error + 0.1 * (x - truth[None])  # made from its half
+            z = truth[None] + z_error + 0.2 * (x - truth[None])
+            mean, error = metrics.rel_l2_change(z, y, x, epsilon=1e8)
+            true = jnp.mean((z - truth[None]) ** 2 - (y - truth[None]) ** 2)
+            return mean * 1e8 - true, mean * 1e8, error * 1e8
+
+        keys = jax.random.split(jax.random.key(0), 4000)
+        difference, estimate, error = jax.jit(jax.vmap(excess))(keys)
+        # The weight of 1e8 varies with y by 1e-7 of the value.
+        assert_mean(difference, 0.0)
+        assert np.sign(estimate.mean()) == np.sign(z_error**2 - y_error**2)
+        np.testing.assert_allclose(error.mean(), difference.std(), rtol=0.3)
+        sure = metrics.Change(estimate.mean(), error.mean())
+        assert sure.helps == (z_error < y_error)
+        assert not metrics.Change(-error.mean(), 2 * error.mean()).helps
+
+
+def test_a_change_leaves_bad_pixels_out():
+    x, y, z = jax.random.uniform(jax.random.key(0), (3, 2, 8, 8, 3))
+    clean = metrics.rel_l2_change(z[:, 1:], y[:, 1:], x[:, 1:])
+    for image in range(3):
+        data = [z, y, x]
+        data[image] = data[image].at[:, 0].set(jnp.nan)
+        found = metrics.rel_l2_change(*data)
+        np.testing.assert_allclose(found, clean, rtol=1e-12)
+
+
 def test_tone_map_is_monotone_and_finite():
     x = jnp.concatenate([jnp.array([-1.0, 0.0]), jnp.geomspace(1e-8, 1e30, 200)])
     for dtype in ("float32", "float64"):
