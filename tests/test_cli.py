@@ -60,7 +60,7 @@ def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)
     if method == "auto":
         method = "whitened"
-        assert re.search(r"half buffers: whitened adds -0\.\d+ \+- 0\.\d+ rel", out)
+        assert re.search(r"half buffers, whitened adds -0\.\d+ \+- 0\.\d+ rel", out)
     assert status == 0
     image = exr.read_image(path)
     r, noise = glass_frame.reference
@@ -79,7 +79,7 @@ def test_combine_keeps_what_it_cannot_better(jscomb, tmp_path, glass_frame):
     exr.write_frame(tmp_path / "f.exr", perfect)
     status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
     assert status == 0
-    assert re.search(r"half buffers: whitened adds \+", out)
+    assert re.search(r"half buffers, whitened adds \+", out)
     assert "perfect kept" in out
     np.testing.assert_array_equal(exr.read_image(tmp_path / "o.exr"), truth)
     assert exr.read_provenance(tmp_path / "o.exr")["method"] == "kept"
