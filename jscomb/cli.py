@@ -140,8 +140,8 @@ def combine(
         biased: EXR file of the biased image, or its name within the frame. By default
             the frame's only one; a frame without any is denoised by Open Image Denoise.
         method: whitened, or james-stein as in the paper without its network; auto is
-            whitened, unless the half buffers say that it would raise the error: then
-            the biased image is kept.
+            whitened where the half buffers show that it lowers the error, or there are
+            none, else the biased image as it is.
         samples: samples a pixel, where the file does not say.
     """
     path, loaded = frame, exr.read_frame(frame, samples=samples)

@@ -119,7 +119,7 @@ def rel_l2_change(
     Raises:
         ValueError: while tracing, if shapes differ.
     """
-    means, errors = [], []
+    means, variances = [], []
     for half in (0, 1):
         z, y, x = candidates[half], baselines[half], unbiased[1 - half]
         check_same_shape(unbiased=x, candidates=z, baselines=y)
@@ -130,8 +130,8 @@ def rel_l2_change(
         mean = _mean(change, mask)
         spread = _mean(jnp.square(change - mean), mask)
         means.append(mean)
-        errors.append(jnp.sqrt(spread / jnp.sum(mask).astype(mean.dtype)))
-    return Change((means[0] + means[1]) / 2, jnp.hypot(*errors) / 2)
+        variances.append(spread / jnp.sum(mask).astype(mean.dtype))
+    return Change((means[0] + means[1]) / 2, _root(variances[0] + variances[1]) / 2)
 
 
 def rmse(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
@@ -150,8 +150,7 @@ def rmse(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
     """
     image, reference = _pair(image, reference, mask)
     square = _mean(jnp.square(image - reference), mask)
-    exact = square == 0
-    return jnp.where(exact, 0.0, jnp.sqrt(jnp.where(exact, 1.0, square)))
+    return _root(square)
 
 
 def smape(
@@ -317,6 +316,12 @@ def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> flo
         said = (done.stdout + done.stderr).decode(errors="replace").strip()
         raise RuntimeError(f"the FLIP evaluator failed ({done.returncode}): {said}")
     return float(value)
+
+
+def _root(square: Scalar) -> Scalar:
+    """Square root with derivative 0 at 0; NaN stays NaN."""
+    exact = square == 0
+    return jnp.where(exact, 0.0, jnp.sqrt(jnp.where(exact, 1.0, square)))
 
 
 def _pair(image: Image, reference: Image, mask: Mask | None) -> tuple[Image, Image]:

@@ -79,7 +79,7 @@ def test_combine_keeps_what_it_cannot_better(jscomb, tmp_path, glass_frame):
     exr.write_frame(tmp_path / "f.exr", perfect)
     status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
     assert status == 0
-    assert re.search(r"half buffers, whitened adds \+", out)
+    assert "by the half buffers, whitened adds" in out
     assert "perfect kept" in out
     np.testing.assert_array_equal(exr.read_image(tmp_path / "o.exr"), truth)
     assert exr.read_provenance(tmp_path / "o.exr")["method"] == "kept"

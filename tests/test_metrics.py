@@ -127,6 +127,15 @@ def test_a_change_is_known_without_a_reference():
         assert not metrics.Change(-error.mean(), 2 * error.mean()).helps
 
 
+def test_no_change_is_exactly_none_with_finite_derivatives():
+    x, y = jax.random.uniform(jax.random.key(0), (2, 2, 5, 4, 3))
+    change = metrics.rel_l2_change(y, y, x)
+    assert (change.mean, change.standard_error, change.helps) == (0, 0, False)
+    bound = lambda *data: sum(metrics.rel_l2_change(*data))
+    for gradient in jax.jit(jax.grad(bound, argnums=(0, 1, 2)))(y, y, x):
+        assert np.isfinite(gradient).all()
+
+
 def test_a_change_leaves_bad_pixels_out():
     x, y, z = jax.random.uniform(jax.random.key(0), (3, 2, 8, 8, 3))
     clean = metrics.rel_l2_change(z[:, 1:], y[:, 1:], x[:, 1:])

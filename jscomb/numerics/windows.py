@@ -5,10 +5,11 @@ reflected, never wrapped, because a reflected pixel is not a new sample. So the 
 p_c of its pixels varies, and any image of at least 1x1 works, also one smaller than the
 window.
 
-Everything is separable and made of additions of the window's own pixels. Running
-differences (integral images) are never used: one firefly of 1e6 would erase the float32
-digits of every later pixel in its row. Columns are slid by doubling (sums over 1, 2, 4,
-... pixels, put together by the bits of w), the fastest form on a CPU; rows by
+Sums are made of additions of the window's own pixels, separably where all windows have
+the same weights. Running differences (integral images) are never used: one firefly of
+1e6 would erase the float32 digits of every later pixel in its row. Columns are slid by
+doubling (sums over 1, 2, 4, ... pixels, put together by the bits of w), the fastest
+form on a CPU; rows by
 `lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
 (two collective permutes, where doubling needs twelve). Gaussian and given weights have
 no such form: sharded by rows they exchange pixels once for every row of the window.
