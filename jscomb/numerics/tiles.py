@@ -1,0 +1,168 @@
+"""An image as overlapping tiles: cut apart, worked on a few at a time, summed again.
+
+For work that couples each pixel with a large window and needs much memory a pixel. A
+tile is a square block of centres, `stride` pixels apart, that share one neighbourhood:
+the block and `reach` pixels around it. Layout: planes [K,H,W], channels first, so that
+a pixel's neighbours in a row lie side by side.
+
+Memory: besides the planes only one batch of tiles and one strip of results exist at a
+time. Reverse mode works each batch out again rather than remember it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+Planes = Float[Array, "_ _ _"]  # [K,H,W], or a part of it
+
+
+class Grid(NamedTuple):
+    """Where the centres lie and how many share a tile.
+
+    Attributes:
+        side: centres along one side of a tile.
+        stride: pixels from one centre to the next.
+        reach: radius in pixels of the windows about the centres.
+        batch: most tiles worked on at once.
+    """
+
+    side: int
+    stride: int
+    reach: int
+    batch: int
+
+    @property
+    def step(self) -> int:
+        """Pixels from one tile to the next."""
+        return self.side * self.stride
+
+    def width(self, reach: int) -> int:
+        """Width in pixels of a tile and the `reach` around its centres."""
+        return self.step - self.stride + 1 + 2 * reach
+
+    def centres(self, planes: Planes) -> Planes:
+        """The centres of a tile among the pixels of any of its regions."""
+        around = (planes.shape[-1] - self.width(0)) // 2
+        core = slice(around, planes.shape[-1] - around, self.stride)
+        return planes[:, core, core]
+
+    def first(self, size: int) -> int:
+        """The first centre along an axis of `size` pixels; as far in as the last."""
+        return (size - 1) % self.stride // 2
+
+    def tiles(self, size: int) -> int:
+        """Tiles along an axis of `size` pixels."""
+        return -(-(size - self.first(size)) // self.step)
+
+
+class Region(NamedTuple):
+    """Planes of which each tile sees its centres and some pixels around them.
+
+    Attributes:
+        planes: zero outside the image, [K,H,W].
+        reach: pixels to every side of the outermost centres.
+    """
+
+    planes: Planes
+    reach: int
+
+
+def sum_over_tiles(
+    function: Callable[..., Array], regions: Sequence[Region], grid: Grid
+) -> Planes:
+    """Sum what a function makes of the neighbourhoods of all tiles.
+
+    Args:
+        function: of one tile's regions, [K,n,n] each with n = grid.width(its reach), to
+            planes [C,n,n] with n = grid.width(grid.reach). Mapped over tiles.
+        regions: of one image size.
+        grid: of the centres.
+
+    Returns:
+        at each pixel the sum over the tiles that contain it, [C,H,W].
+    """
+    height, width = regions[0].planes.shape[1:]
+    columns = grid.tiles(width)
+    pieces = -(-columns // grid.batch)  # of a strip, of equally many tiles
+    batch = -(-columns // pieces)
+    reaches = [reach for _, reach in regions]
+    padded = [_padded(region, grid, pieces * batch) for region in regions]
+    size, long = grid.width(grid.reach), pieces * batch * grid.step
+    wide = (batch - 1) * grid.step + size
+
+    def piece(strips: list[Planes], number: Array) -> Planes:
+        """The sum over one batch of tiles, [C,n,wide]."""
+        tiles = []
+        for strip, reach in zip(strips, reaches, strict=True):
+            n = grid.width(reach)
+            # As long as `_cut` wants, so that nothing is padded here.
+            length = (batch + -(-n // grid.step)) * grid.step
+            start = number * batch * grid.step
+            near = lax.dynamic_slice_in_dim(strip, start, length, axis=2)
+            tiles.append(_cut(near, grid.step, n, batch, axis=2))
+        return _paste(jax.vmap(function)(*tiles), grid.step, wide, axis=2)
+
+    def strip(number: Array) -> Planes:
+        """The sum over one row of tiles, [C,n,long + n - step]."""
+        strips = [
+            lax.dynamic_slice_in_dim(
+                planes, number * grid.step, grid.width(reach), axis=1
+            )
+            for planes, reach in zip(padded, reaches, strict=True)
+        ]
+        one = jax.checkpoint(lambda number: piece(strips, number))
+        sums = lax.map(one, jnp.arange(pieces))
+        return _paste(sums, batch * grid.step, long + size - grid.step, axis=2)
+
+    rows = grid.tiles(height)
+    sums = lax.map(jax.checkpoint(strip), jnp.arange(rows))
+    total = _paste(sums, grid.step, (rows - 1) * grid.step + size, axis=1)
+    top, left = (grid.reach - grid.first(n) for n in (height, width))
+    return total[:, top : top + height, left : left + width]
+
+
+def _padded(region: Region, grid: Grid, columns: int) -> Planes:
+    """Planes with zeros around them, for every tile and what `_cut` wants."""
+    planes, reach = region
+    _, height, width = planes.shape
+    n = grid.width(reach)
+    rows = (grid.tiles(height) - 1) * grid.step + n
+    long = (columns + -(-n // grid.step)) * grid.step
+    ends = [(0, 0, 0)]
+    for size, total in ((height, rows), (width, long)):
+        before = reach - grid.first(size)
+        ends.append((before, total - before - size, 0))
+    return lax.pad(planes, jnp.zeros((), planes.dtype), ends)
+
+
+def _cut(planes: Array, step: int, size: int, count: int, axis: int) -> Array:
+    """Pieces of `size` pixels, `step` apart, stacked on a new first axis.
+
+    Written as reshapes and one concatenation that ends in the final layout: XLA then
+    makes the copy here, and does not spread its index arithmetic over every use.
+    """
+    parts = -(-size // step)
+    shape = planes.shape
+    blocks = planes.reshape(*shape[:axis], count + parts, step, *shape[axis + 1 :])
+    pieces = []
+    for k in range(parts):
+        part = lax.slice_in_dim(blocks, k, k + count, axis=axis)
+        part = lax.slice_in_dim(part, 0, min(step, size - k * step), axis=axis + 1)
+        pieces.append(jnp.moveaxis(part, axis, 0))
+    return jnp.concatenate(pieces, axis=axis + 1)
+
+
+def _paste(tiles: Array, step: int, length: int, axis: int) -> Array:
+    """The sum of the pieces at their places: the transpose of `_cut`."""
+    count, size = tiles.shape[0], tiles.shape[axis + 1]
+    whole = (count + -(-size // step)) * step
+    shape = (*tiles.shape[1 : axis + 1], whole, *tiles.shape[axis + 2 :])
+    cut = lambda planes: _cut(planes, step, size, count, axis)
+    (planes,) = jax.linear_transpose(cut, jax.ShapeDtypeStruct(shape, tiles.dtype))(
+        tiles
+    )
+    return lax.slice_in_dim(planes, 0, length, axis=axis)

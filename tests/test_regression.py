@@ -1,0 +1,280 @@
+"""Windowed regression against a loop over windows in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb.numerics import regression
+from jscomb.numerics.regression import gaussian_weights, joint_local_linear
+
+RNG = np.random.default_rng(0)
+
+
+def gaussian(guide, bandwidth):
+    """exp(-|g_i - g_c|^2 / h) of a window about c; h a number or the mean of two."""
+
+    def weigh(c, window):
+        square = ((guide[window] - guide[c]) ** 2).sum(-1)
+        if np.ndim(bandwidth):
+            return np.exp(-2 * square / (bandwidth[window] + bandwidth[c])[..., 0])
+        return np.exp(-square / bandwidth)
+
+    return weigh
+
+
+def oracle(targets, features, *, predict=None, window, stride=1, ridge=0.1, floor=0.1):
+    """One least-squares solve a window, with the constant among the unknowns."""
+    height, width, f = features.shape
+    valid = np.isfinite(np.concatenate([features, *(t for t, _ in targets)], -1)).all(
+        -1
+    )
+    total, weight = np.zeros_like(targets[0][0]), np.zeros((height, width))
+    total[~np.isfinite(total)] = 0
+    r = window // 2
+    penalty = np.diag([0, *np.broadcast_to(ridge, f)])
+    for c in np.ndindex(height, width):
+        on_grid = [
+            (x - (n - 1) % stride // 2) % stride == 0
+            for x, n in zip(c, valid.shape, strict=True)
+        ]
+        if not (valid[c] and all(on_grid)):
+            continue
+        around = tuple(slice(max(0, x - r), x + r + 1) for x in c)
+        inside = valid[around]
+        d = np.where(inside[..., None], features[around] - features[c], 0)
+        d = d / (abs(d).max((0, 1)) + floor)
+        basis = np.concatenate([np.ones((*d.shape[:2], 1)), d], -1)[inside]
+        matrix, right = penalty, 0
+        for target, weigh in targets:
+            w = weigh(c, around)[inside][:, None]
+            matrix = matrix + (basis * w).T @ basis
+            right = right + (basis * w).T @ target[around][inside]
+        predicted = basis @ np.linalg.solve(matrix, right)
+        w = (predict or targets[0][1])(c, around)[inside]
+        total[around][inside] += w[:, None] * predicted
+        weight[around][inside] += w
+    return total / np.where(weight > 0, weight, 1)[..., None], weight
+
+
+def images(height, width, features, channels=2):
+    """Target, guide and features."""
+    return (
+        RNG.uniform(size=(height, width, channels)),
+        RNG.uniform(size=(height, width, 3)),
+        RNG.normal(size=(height, width, features)),
+    )
+
+
+def errors(fit, expected):
+    """Relative errors of the prediction, by the largest channel of a pixel."""
+    prediction, _ = expected
+    scale = abs(prediction).max(-1, keepdims=True) + 1e-300
+    return abs(np.asarray(fit.prediction, np.float64) - prediction) / scale
+
+
+fit = jax.jit(
+    regression.local_linear,
+    static_argnames=("window", "stride", "ridge", "scale_floor"),
+)
+
+
+def assert_accurate(data, bandwidth, **options):
+    """Float64 to rounding; float32 within what the method promises."""
+    target, guide, features = data
+    h = np.asarray(bandwidth)
+    floor = options.pop("scale_floor", 0.1)
+    expected = oracle([(target, gaussian(guide, h))], features, floor=floor, **options)
+    for dtype, most, median in ((np.float64, 1e-8, 1e-10), (np.float32, 1e-3, 1e-4)):
+        arrays = [jnp.asarray(a, dtype) for a in (*data, h)]
+        found = fit(*arrays, scale_floor=floor, **options)
+        assert found.prediction.dtype == dtype
+        error = errors(found, expected)
+        assert error.max() < most
+        assert np.median(error) < median
+        np.testing.assert_allclose(found.weight[..., 0], expected[1], rtol=100 * most)
+
+
+@pytest.mark.parametrize(
+    ("size", "features", "window", "stride"),
+    [
+        ((40, 37), 11, 21, 1),  # several tiles along both axes, and clipped windows
+        ((33, 70), 3, 51, 2),
+        ((30, 33), 2, 9, 3),
+        ((19, 24), 1, 7, 7),
+        ((1, 1), 2, 51, 1),
+        ((1, 9), 2, 5, 2),
+        ((9, 1), 0, 3, 1),  # without features: a weighted mean
+        ((4, 5), 2, 1, 1),
+    ],
+)
+def test_is_the_loop(size, features, window, stride):
+    data = images(*size, features)
+    assert_accurate(data, 0.1, window=window, stride=stride)
+
+
+def test_a_bandwidth_for_each_pixel():
+    data = images(12, 20, 2)
+    bandwidth = RNG.uniform(0.02, 0.5, (12, 20, 1))
+    assert_accurate(data, bandwidth, window=7)
+    same = fit(*map(jnp.asarray, data), jnp.full((12, 20, 1), 0.1), window=7)
+    one = fit(*map(jnp.asarray, data), 0.1, window=7)
+    np.testing.assert_allclose(same.prediction, one.prediction, rtol=1e-12)
+
+
+def test_two_targets_share_one_model():
+    (a, ga, features), (b, gb, _) = images(14, 18, 3), images(14, 18, 3)
+    ha, hb = RNG.uniform(0.05, 0.5, (2, 14, 18, 1))
+    predict = gaussian(ga, 0.2)
+    expected = oracle(
+        [(a, gaussian(ga, ha)), (b, gaussian(gb, hb))],
+        features,
+        predict=predict,
+        window=9,
+    )
+
+    def joint(a, ga, ha, b, gb, hb, features):
+        return joint_local_linear(
+            [(a, gaussian_weights(ga, ha)), (b, gaussian_weights(gb, hb))],
+            features,
+            predict=gaussian_weights(ga, 0.2),
+            window=9,
+        )
+
+    found = jax.jit(joint)(*map(jnp.asarray, (a, ga, ha, b, gb, hb, features)))
+    assert errors(found, expected).max() < 1e-10
+    np.testing.assert_allclose(found.weight[..., 0], expected[1], rtol=1e-10)
+
+
+def hard_cases():
+    """Target, guide, features and bandwidth that break careless arithmetic."""
+    t, g, f = images(24, 26, 3)
+    firefly = 1e-3 * t
+    firefly[12, 13] = 1e6
+    collinear = np.concatenate([f, f[..., :1], 2 * f[..., :1] + 1, 0 * f[..., :1]], -1)
+    bright = 1e-3 * f
+    bright[12, 13] = 1e6
+    return {
+        "firefly in the target": (firefly, g, f, 0.1),
+        "firefly in all": (
+            firefly,
+            1e-3 * g + (firefly.max(-1, keepdims=True) > 1),
+            bright,
+            0.1,
+        ),
+        "collinear and constant features": (t, g, collinear, 0.1),
+        "features far from zero": (t, g, f + 1000, 0.1),
+        "one effective pixel": (t, 100 * g, f, 1e-3),
+        "faint": (1e-8 * t, g, 1e-8 * f, 0.1),
+        "all alike": (t, 0 * g, f, 0.1),
+        "nothing varies": (0 * t + 1, 0 * g, 0 * f, 0.1),
+    }
+
+
+@pytest.mark.parametrize("case", hard_cases())
+def test_hard_cases(case):
+    """Accurate, and with finite derivatives, also in float32."""
+    *data, h = hard_cases()[case]
+    assert_accurate(data, h, window=11)
+    total = lambda *images: jnp.sum(fit(*images, h, window=11).prediction)
+    single = [jnp.asarray(i, jnp.float32) for i in data]
+    for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(*single):
+        assert np.isfinite(gradient).all()
+
+
+def test_a_bright_pixel_keeps_its_light():
+    """The constant has no ridge: an isolated pixel is not darkened at all."""
+    spot = np.zeros((9, 9, 1))
+    spot[4, 4] = 1
+    found = fit(*map(jnp.asarray, (spot, spot, spot)), 1e-3, window=5)
+    np.testing.assert_allclose(found.prediction, spot, atol=1e-12)
+
+
+def test_equal_features_with_the_ridge_shared_are_one_feature():
+    t, g, f = map(jnp.asarray, images(12, 12, 1))
+    twice = jnp.concatenate([f, f], axis=-1)
+    both = regression.local_linear(t, g, twice, 0.1, window=7)
+    one = regression.local_linear(t, g, f, 0.1, window=7, ridge=jnp.array([0.05]))
+    np.testing.assert_allclose(one.prediction, both.prediction, rtol=1e-10)
+
+
+@pytest.mark.parametrize("which", [0, 1, 2, 3])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_pixel_takes_no_part(which, bad):
+    data = [*images(10, 11, 2), RNG.uniform(0.1, 0.2, (10, 11, 1))]
+    poisoned = [d.copy() for d in data]
+    poisoned[which][4, 5, 0] = bad
+    if which == 3:
+        poisoned[which][4, 5, 0] = [0.0, -1.0][bad == np.inf]
+    missing = data[0].copy()
+    missing[4, 5] = np.nan
+    expected = oracle([(missing, gaussian(data[1], data[3]))], data[2], window=5)
+    found = fit(*map(jnp.asarray, poisoned), window=5)
+    assert np.isfinite(found.prediction).all()
+    assert found.weight[4, 5, 0] == 0
+    assert found.prediction[4, 5].tolist() == [0.0, 0.0]
+    error = errors(found, expected)
+    error[4, 5] = 0
+    assert error.max() < 1e-10
+    total = lambda *i: fit(*i, window=5).prediction.sum()
+    gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(
+        *map(jnp.asarray, poisoned)
+    )
+    assert all(np.isfinite(g).all() for g in gradients)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_gradients(stride):
+    t, g, f = map(jnp.asarray, images(7, 8, 2, channels=1))
+    h = jnp.asarray(RNG.uniform(0.1, 0.2, (7, 8, 1)))
+    ridge = jnp.array([0.1, 0.2])
+
+    def predict(t, g, f, h, ridge):
+        return regression.local_linear(
+            t, g, f, h, window=5, stride=stride, ridge=ridge
+        ).prediction
+
+    check_grads(jax.jit(predict), (t, g, f, h, ridge), order=1, rtol=1e-5)
+
+
+def test_vmap_is_a_loop():
+    batch = [
+        jnp.asarray(np.stack(i))
+        for i in zip(images(9, 9, 2), images(9, 9, 2), strict=True)
+    ]
+    run = lambda t, g, f: fit(t, g, f, 0.1, window=5)
+    mapped = jax.jit(jax.vmap(run))(*batch)
+    for k in range(2):
+        one = run(*(b[k] for b in batch))
+        np.testing.assert_allclose(mapped.prediction[k], one.prediction, rtol=1e-10)
+
+
+def test_reverse_mode_does_not_remember_the_tiles():
+    """Memory of the gradient stays far below the weights of all windows."""
+    shapes = [jax.ShapeDtypeStruct((128, 128, c), jnp.float32) for c in (1, 1, 1)]
+    total = lambda *i: fit(*i, 0.1, window=31).prediction.sum()
+    compiled = jax.jit(jax.grad(total, argnums=(0, 1, 2))).lower(*shapes).compile()
+    memory = compiled.memory_analysis().temp_size_in_bytes
+    assert memory < 4 * 128**2 * 31**2
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bandwidth": 0.0}, "bandwidth must be positive, got 0.0"),
+        ({"ridge": -1.0}, "ridge must be positive, got -1.0"),
+        ({"scale_floor": 0.0}, "scale_floor must be positive, got 0.0"),
+        ({"window": 4}, "window must be odd and positive, got 4"),
+        ({"stride": 9}, "stride must be from 1 to the window 5, got 9"),
+        ({"features": jnp.ones((6, 6, 2))}, r"features has shape \(6, 6, 2\), target"),
+        ({"guide": jnp.ones((5, 6, 2))}, r"guide has shape \(5, 6, 2\), target"),
+        ({"target": jnp.ones((6, 7))}, r"target 0 must have shape \[H, W, C\]"),
+    ],
+)
+def test_bad_input(change, message):
+    good = dict.fromkeys(("target", "guide", "features"), jnp.ones((6, 7, 2)))
+    options = {"bandwidth": 0.1, "window": 5} | good | change
+    with pytest.raises(ValueError, match=message):
+        regression.local_linear(**options)
