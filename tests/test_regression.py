@@ -35,11 +35,7 @@ def oracle(targets, features, *, predict=None, window, stride=1, ridge=0.1, floo
     r = window // 2
     penalty = np.diag([0, *np.broadcast_to(ridge, f)])
     for c in np.ndindex(height, width):
-        on_grid = [
-            (x - (n - 1) % stride // 2) % stride == 0
-            for x, n in zip(c, valid.shape, strict=True)
-        ]
-        if not (valid[c] and all(on_grid)):
+        if not valid[c] or (stride > 1 and not on_grid(c, window, stride)):
             continue
         around = tuple(slice(max(0, x - r), x + r + 1) for x in c)
         inside = valid[around]
@@ -56,6 +52,14 @@ def oracle(targets, features, *, predict=None, window, stride=1, ridge=0.1, floo
         total[around][inside] += w[:, None] * predicted
         weight[around][inside] += w
     return total / np.where(weight > 0, weight, 1)[..., None], weight
+
+
+def on_grid(c, window, stride):
+    """One centre in each block, on another line in the next."""
+    (row, shift_row), (column, shift_column) = (divmod(x, stride) for x in c)
+    side = regression._grid(window, stride).side
+    shift = lambda block: block % side % stride
+    return (shift_row, shift_column) == (shift(column), shift(row))
 
 
 def images(height, width, features, channels=2):

@@ -191,7 +191,7 @@ def joint_local_linear(
         """The sums over a tile's windows of weighted predictions, and of weights."""
         size = basis.shape[1:]
         basis, centred = _centred(basis, grid)
-        scale = jnp.where(centred[None], _flat(scale[:, ::stride, ::stride]), 1.0)
+        scale = jnp.where(centred[None], grid.centres(scale), 1.0)
         weights = [
             jnp.where(inside, kernel.function(plane, grid), 0.0)
             for kernel, plane in zip(kernels, planes[len(targets) :], strict=True)
@@ -260,14 +260,14 @@ def _gaussian(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
 def _gaussian_of_both(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
     """The same with the mean of both pixels' bandwidths, the last plane."""
     h = jnp.where(planes[-1:] > 0, planes[-1:], 1.0)
-    (near,), (centre,) = _flat(h), _flat(grid.centres(h))
+    (near,), (centre,) = _flat(h), grid.centres(h)
     square = _square_distance(planes[:-1], grid)
     return jnp.exp(-2 * square / (near[None] + centre[:, None]))
 
 
 def _square_distance(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
     """|p_i - p_c|^2; not expanded into products, which would cancel."""
-    pairs = zip(_flat(planes), _flat(grid.centres(planes)), strict=True)
+    pairs = zip(_flat(planes), grid.centres(planes), strict=True)
     zero = jnp.zeros((), planes.dtype)
     return sum((jnp.square(near[None] - c[:, None]) for near, c in pairs), start=zero)
 
@@ -284,10 +284,10 @@ def _centred(basis: Planes, grid: Grid) -> tuple[Float[Array, "p n"], Array]:
     The origin is the valid centre next to the tile's middle. It changes no result but
     the rounding.
     """
-    centres = _flat(grid.centres(basis))
+    centres = grid.centres(basis)
     valid = centres[0] > 0
-    middle = np.arange(grid.side) - (grid.side - 1) / 2
-    distance = np.add.outer(middle**2, middle**2).ravel().astype(basis.dtype)
+    distance = ((grid.places - (grid.step - 1) / 2) ** 2).sum(axis=0)
+    distance = distance.astype(basis.dtype)
     origin = centres[:, jnp.argmin(jnp.where(valid, distance, np.inf))]
     origin = lax.stop_gradient(origin).at[0].set(0.0)
     flat = _flat(basis)
@@ -359,11 +359,9 @@ def _scale(features: Image, valid: Mask, window: int) -> Image:
 
 def _inside(grid: Grid) -> np.ndarray:
     """Which pixels of a tile's neighbourhood lie in each centre's window, [M,N]."""
-    near = np.arange(grid.width(grid.reach))
-    one = np.abs(near - near[grid.reach : len(near) - grid.reach : grid.stride, None])
-    rows = one <= grid.reach
-    both = rows[:, None, :, None] & rows[None, :, None, :]
-    return both.reshape(grid.side**2, -1)
+    near = np.arange(grid.width(grid.reach)) - grid.reach
+    rows, columns = (abs(near - place[:, None]) <= grid.reach for place in grid.places)
+    return (rows[:, :, None] & columns[:, None, :]).reshape(len(rows), -1)
 
 
 def _grid(window: int, stride: int) -> Grid:

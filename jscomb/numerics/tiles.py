@@ -1,8 +1,8 @@
 """An image as overlapping tiles: cut apart, worked on a few at a time, summed again.
 
 For work that couples each pixel with a large window and needs much memory a pixel. A
-tile is a square block of centres, `stride` pixels apart, that share one neighbourhood:
-the block and `reach` pixels around it. Layout: planes [K,H,W], channels first, so that
+tile is a square with some centres in it that share one neighbourhood: the square and
+`reach` pixels around it. Layout: planes [K,H,W], channels first, so that
 a pixel's neighbours in a row lie side by side.
 
 Memory: besides the planes only one batch of tiles and one strip of results exist at a
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -23,9 +24,13 @@ Planes = Float[Array, "_ _ _"]  # [K,H,W], or a part of it
 class Grid(NamedTuple):
     """Where the centres lie and how many share a tile.
 
+    There is one centre in every square block of `stride` pixels a side. Its row in the
+    block changes with the block's column and its column with the block's row, so that
+    every line of pixels has centres, and a thin edge is not missed.
+
     Attributes:
-        side: centres along one side of a tile.
-        stride: pixels from one centre to the next.
+        side: blocks along one side of a tile.
+        stride: pixels along one side of a block.
         reach: radius in pixels of the windows about the centres.
         batch: most tiles worked on at once.
     """
@@ -37,26 +42,32 @@ class Grid(NamedTuple):
 
     @property
     def step(self) -> int:
-        """Pixels from one tile to the next."""
+        """Pixels along one side of a tile, and from one to the next."""
         return self.side * self.stride
 
+    @property
+    def places(self) -> np.ndarray:
+        """Row and column in the tile of each of its centres, [2,M]."""
+        block = np.arange(self.side)
+        shift = block % self.stride
+        if self.side < self.stride:
+            shift = block * self.stride // self.side
+        rows = np.add.outer(block * self.stride, shift)
+        return np.stack([rows.ravel(), rows.T.ravel()])
+
     def width(self, reach: int) -> int:
-        """Width in pixels of a tile and the `reach` around its centres."""
-        return self.step - self.stride + 1 + 2 * reach
-
-    def centres(self, planes: Planes) -> Planes:
-        """The centres of a tile among the pixels of any of its regions."""
-        around = (planes.shape[-1] - self.width(0)) // 2
-        core = slice(around, planes.shape[-1] - around, self.stride)
-        return planes[:, core, core]
-
-    def first(self, size: int) -> int:
-        """The first centre along an axis of `size` pixels; as far in as the last."""
-        return (size - 1) % self.stride // 2
+        """Width in pixels of a tile and what lies around it."""
+        return self.step + 2 * reach
 
     def tiles(self, size: int) -> int:
         """Tiles along an axis of `size` pixels."""
-        return -(-(size - self.first(size)) // self.step)
+        return -(-size // self.step)
+
+    def centres(self, planes: Planes) -> Float[Array, "k m"]:
+        """What a tile's centres have, of any of its regions."""
+        count, size, _ = planes.shape
+        rows, columns = self.places + (size - self.step) // 2
+        return planes.reshape(count, size * size)[:, rows * size + columns]
 
 
 class Region(NamedTuple):
@@ -64,7 +75,7 @@ class Region(NamedTuple):
 
     Attributes:
         planes: zero outside the image, [K,H,W].
-        reach: pixels to every side of the outermost centres.
+        reach: pixels to every side of the tile.
     """
 
     planes: Planes
@@ -72,15 +83,20 @@ class Region(NamedTuple):
 
 
 def sum_over_tiles(
-    function: Callable[..., Array], regions: Sequence[Region], grid: Grid
+    function: Callable[..., Array],
+    regions: Sequence[Region],
+    grid: Grid,
+    *,
+    reach: int | None = None,
 ) -> Planes:
     """Sum what a function makes of the neighbourhoods of all tiles.
 
     Args:
         function: of one tile's regions, [K,n,n] each with n = grid.width(its reach), to
-            planes [C,n,n] with n = grid.width(grid.reach). Mapped over tiles.
+            planes [C,n,n] with n = grid.width(reach). Mapped over tiles.
         regions: of one image size.
         grid: of the centres.
+        reach: how far around its tile a result goes; None for that of the windows.
 
     Returns:
         at each pixel the sum over the tiles that contain it, [C,H,W].
@@ -89,16 +105,17 @@ def sum_over_tiles(
     columns = grid.tiles(width)
     pieces = -(-columns // grid.batch)  # of a strip, of equally many tiles
     batch = -(-columns // pieces)
-    reaches = [reach for _, reach in regions]
+    reaches = [around for _, around in regions]
+    reach = grid.reach if reach is None else reach
     padded = [_padded(region, grid, pieces * batch) for region in regions]
-    size, long = grid.width(grid.reach), pieces * batch * grid.step
+    size, long = grid.width(reach), pieces * batch * grid.step
     wide = (batch - 1) * grid.step + size
 
     def piece(strips: list[Planes], number: Array) -> Planes:
         """The sum over one batch of tiles, [C,n,wide]."""
         tiles = []
-        for strip, reach in zip(strips, reaches, strict=True):
-            n = grid.width(reach)
+        for strip, around in zip(strips, reaches, strict=True):
+            n = grid.width(around)
             # As long as `_cut` wants, so that nothing is padded here.
             length = (batch + -(-n // grid.step)) * grid.step
             start = number * batch * grid.step
@@ -110,9 +127,9 @@ def sum_over_tiles(
         """The sum over one row of tiles, [C,n,long + n - step]."""
         strips = [
             lax.dynamic_slice_in_dim(
-                planes, number * grid.step, grid.width(reach), axis=1
+                planes, number * grid.step, grid.width(around), axis=1
             )
-            for planes, reach in zip(padded, reaches, strict=True)
+            for planes, around in zip(padded, reaches, strict=True)
         ]
         one = jax.checkpoint(lambda number: piece(strips, number))
         sums = lax.map(one, jnp.arange(pieces))
@@ -121,8 +138,7 @@ def sum_over_tiles(
     rows = grid.tiles(height)
     sums = lax.map(jax.checkpoint(strip), jnp.arange(rows))
     total = _paste(sums, grid.step, (rows - 1) * grid.step + size, axis=1)
-    top, left = (grid.reach - grid.first(n) for n in (height, width))
-    return total[:, top : top + height, left : left + width]
+    return total[:, reach : reach + height, reach : reach + width]
 
 
 def _padded(region: Region, grid: Grid, columns: int) -> Planes:
@@ -134,8 +150,7 @@ def _padded(region: Region, grid: Grid, columns: int) -> Planes:
     long = (columns + -(-n // grid.step)) * grid.step
     ends = [(0, 0, 0)]
     for size, total in ((height, rows), (width, long)):
-        before = reach - grid.first(size)
-        ends.append((before, total - before - size, 0))
+        ends.append((reach, total - reach - size, 0))
     return lax.pad(planes, jnp.zeros((), planes.dtype), ends)
 
 
