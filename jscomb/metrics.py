@@ -119,19 +119,40 @@ def rel_l2_change(
     Raises:
         ValueError: while tracing, if shapes differ.
     """
-    means, variances = [], []
+    changes = []
     for half in (0, 1):
         z, y, x = candidates[half], baselines[half], unbiased[1 - half]
         check_same_shape(unbiased=x, candidates=z, baselines=y)
-        mask = finite(z, y, x)
-        z, y, x = (_masked(mask, image) for image in (z, y, x))
-        weight = jnp.square(jnp.mean(y, axis=-1, keepdims=True)) + epsilon
-        change = jnp.mean((z - y) * (z + y - 2 * x) / weight, axis=-1, keepdims=True)
-        mean = _mean(change, mask)
-        spread = _mean(jnp.square(change - mean), mask)
-        means.append(mean)
-        variances.append(spread / jnp.sum(mask).astype(mean.dtype))
-    return Change((means[0] + means[1]) / 2, _root(variances[0] + variances[1]) / 2)
+        square = (z - y) * (z + y - 2 * x)
+        changes.append(mean_change(square, y, epsilon=epsilon))
+    means, errors = (jnp.stack(i) for i in zip(*changes, strict=True))
+    return Change(jnp.mean(means), _root(jnp.sum(jnp.square(errors))) / 2)
+
+
+def mean_change(
+    square: Image, baseline: Image, *, epsilon: Scalar | float = 0.01
+) -> Change:
+    """Mean over the frame of estimated changes of the squared error.
+
+    Args:
+        square: change of each pixel's squared error, squared radiance, shape [H,W,C].
+        baseline: radiance that it is relative to, shape [H,W,C].
+        epsilon: squared radiance that keeps black pixels from deciding.
+
+    Returns:
+        the change of the relative L2; pixels that are not finite are left out.
+
+    Raises:
+        ValueError: while tracing, if the shapes differ.
+    """
+    check_same_shape(square=square, baseline=baseline)
+    mask = finite(square, baseline)
+    square, baseline = _masked(mask, square), _masked(mask, baseline)
+    weight = jnp.square(jnp.mean(baseline, axis=-1, keepdims=True)) + epsilon
+    change = jnp.mean(square / weight, axis=-1, keepdims=True)
+    mean = _mean(change, mask)
+    spread = _mean(jnp.square(change - mean), mask)
+    return Change(mean, _root(spread / jnp.sum(mask).astype(mean.dtype)))
 
 
 def rmse(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:

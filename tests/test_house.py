@@ -17,6 +17,7 @@ ROOMS = [
     "typing",
     "numerics",
     "frame",
+    "features",
     "metrics",
     "james_stein",
     "denoisers",

@@ -84,6 +84,11 @@ fit = jax.jit(
 )
 
 
+gradient = jax.jit(
+    jax.grad(lambda *i: fit(*i, window=11).prediction.sum(), argnums=(0, 1, 2, 3))
+)
+
+
 def assert_accurate(data, bandwidth, **options):
     """Float64 to rounding; float32 within what the method promises."""
     target, guide, features = data
@@ -156,7 +161,7 @@ def hard_cases():
     t, g, f = images(24, 26, 3)
     firefly = 1e-3 * t
     firefly[12, 13] = 1e6
-    collinear = np.concatenate([f, f[..., :1], 2 * f[..., :1] + 1, 0 * f[..., :1]], -1)
+    collinear = np.concatenate([f[..., :1], 2 * f[..., :1] + 1, 0 * f[..., :1]], -1)
     bright = 1e-3 * f
     bright[12, 13] = 1e6
     return {
@@ -181,10 +186,8 @@ def test_hard_cases(case):
     """Accurate, and with finite derivatives, also in float32."""
     *data, h = hard_cases()[case]
     assert_accurate(data, h, window=11)
-    total = lambda *images: jnp.sum(fit(*images, h, window=11).prediction)
-    single = [jnp.asarray(i, jnp.float32) for i in data]
-    for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(*single):
-        assert np.isfinite(gradient).all()
+    single = [jnp.asarray(i, jnp.float32) for i in (*data, h)]
+    assert all(np.isfinite(g).all() for g in gradient(*single))
 
 
 def test_a_bright_pixel_keeps_its_light():
@@ -204,28 +207,24 @@ def test_equal_features_with_the_ridge_shared_are_one_feature():
 
 
 @pytest.mark.parametrize("which", [0, 1, 2, 3])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_bad_pixel_takes_no_part(which, bad):
-    data = [*images(10, 11, 2), RNG.uniform(0.1, 0.2, (10, 11, 1))]
-    poisoned = [d.copy() for d in data]
-    poisoned[which][4, 5, 0] = bad
-    if which == 3:
-        poisoned[which][4, 5, 0] = [0.0, -1.0][bad == np.inf]
+def test_a_bad_pixel_takes_no_part(which):
+    data = [*images(13, 14, 2), RNG.uniform(0.1, 0.2, (13, 14, 1))]
     missing = data[0].copy()
     missing[4, 5] = np.nan
-    expected = oracle([(missing, gaussian(data[1], data[3]))], data[2], window=5)
-    found = fit(*map(jnp.asarray, poisoned), window=5)
-    assert np.isfinite(found.prediction).all()
-    assert found.weight[4, 5, 0] == 0
-    assert found.prediction[4, 5].tolist() == [0.0, 0.0]
-    error = errors(found, expected)
-    error[4, 5] = 0
-    assert error.max() < 1e-10
-    total = lambda *i: fit(*i, window=5).prediction.sum()
-    gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(
-        *map(jnp.asarray, poisoned)
-    )
-    assert all(np.isfinite(g).all() for g in gradients)
+    weigh = gaussian(data[1], data[3])
+    expected = oracle([(missing, weigh)], data[2], window=11)
+    for bad in (np.nan, np.inf) if which < 3 else (np.nan, 0.0, -1.0):
+        poisoned = [d.copy() for d in data]
+        poisoned[which][4, 5, 0] = bad
+        arrays = [jnp.asarray(p) for p in poisoned]
+        found = fit(*arrays, window=11)
+        assert np.isfinite(found.prediction).all()
+        assert found.weight[4, 5, 0] == 0
+        assert found.prediction[4, 5].tolist() == [0.0, 0.0]
+        error = errors(found, expected)
+        error[4, 5] = 0
+        assert error.max() < 1e-10
+        assert all(np.isfinite(g).all() for g in gradient(*arrays))
 
 
 @pytest.mark.parametrize("stride", [1, 2])

@@ -1,3 +1,5 @@
 """Makers of biased images."""
 
+from jscomb.denoisers import nfor as nfor
+from jscomb.denoisers import nonlocal_means as nonlocal_means
 from jscomb.denoisers import oidn as oidn

@@ -1,4 +1,5 @@
 """Mathematics shared by the combiners; nothing here knows about a paper."""
 
 from jscomb.numerics import guards as guards
+from jscomb.numerics import regression as regression
 from jscomb.numerics import windows as windows

@@ -1,0 +1,225 @@
+r"""NFOR: nonlinearly weighted first-order regression on the renderer's features.
+
+A consistent denoiser without a network: as samples grow, weights fall on ever fewer
+pixels and the bias vanishes. Layout: images [H,W,C], linear radiance. In three steps:
+
+    features    f, each half filtered by non-local means with weights of the other half
+    regression  x_a by local_linear on the features, weights by non-local means on x_b,
+                once for each strength; and the other way round
+    mixing      of both strengths, by the share that makes the halves' error least
+
+Target and weights come from different halves, so no fit follows its own noise.
+
+Sources:
+    B. Bitterli, F. Rousselle, B. Moon, J. Iglesias-Guitian, D. Adler, K. Mitchell,
+    W. Jarosz, J. Novak, "Nonlinearly Weighted First-order Regression for Denoising
+    Monte Carlo Renderings", 2016. Our mixing share is the least-squares one over a
+    window, where the paper selects the better strength and filters the selection.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.denoisers import nonlocal_means
+from jscomb.features import select, stack
+from jscomb.frame import Biased, Frame
+from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.numerics.regression import joint_local_linear
+from jscomb.numerics.windows import window_mean, window_sum
+from jscomb.typing import Image, Variance
+
+Features = Float[Array, "h w f"]
+
+# Of the features' pre-filter, and of the window that their variance is pooled over.
+_FEATURE_WINDOW, _FEATURE_STRENGTH, _POOL = 11, 1.0, 5
+
+
+def denoise(
+    unbiased_a: Image,
+    unbiased_b: Image,
+    variance_a: Variance,
+    variance_b: Variance,
+    features_a: Features,
+    features_b: Features,
+    *,
+    window: int = 19,
+    patch: int = 7,
+    strengths: tuple[float, float] = (0.5, 1.0),
+    stride: int = 1,
+    mixing: int = 31,
+    ridge: Float[Array, " f"] | float = 0.1,
+) -> tuple[Image, Image]:
+    """Denoise both halves, each with the other's weights and features.
+
+    Pure, differentiable in every array, and scale-equivariant. Costs four calls of
+    `local_linear` with small windows.
+
+    Args:
+        unbiased_a: x_a, radiance, shape [H,W,C].
+        unbiased_b: x_b, likewise, of other samples.
+        variance_a: of the mean x_a, squared radiance, shape [H,W,C].
+        variance_b: of x_b.
+        features_a: of half a, shape [H,W,F]; F may be 0. Pre-filter noisy ones.
+        features_b: of half b.
+        window: width of the windows in pixels, odd.
+        patch: width of the patches that non-local means compares, odd.
+        strengths: of non-local means, the narrower first.
+        stride: pixels between the centres of windows.
+        mixing: width of the window that the share of each strength is found over, odd.
+        ridge: of the regression.
+
+    Returns:
+        both halves denoised, [H,W,C] each; they share their inputs, and their mean is
+        the denoised image. At an invalid pixel the half itself if finite, else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or a width is even.
+
+    Source: Bitterli et al. 2016.
+    """
+    check_same_shape(
+        unbiased_a=unbiased_a,
+        unbiased_b=unbiased_b,
+        variance_a=variance_a,
+        variance_b=variance_b,
+    )
+
+    def fit(x: Image, guide: Image, v: Variance, f: Features, strength: float) -> Image:
+        weights = nonlocal_means.weights(
+            guide, pool_variance(v), patch=patch, strength=strength
+        )
+        prediction, weight = joint_local_linear(
+            [(x, weights)], f, window=window, stride=stride, ridge=ridge
+        )
+        return jnp.where(weight > 0, prediction, first_finite(x))
+
+    narrow, wide = (
+        (
+            fit(unbiased_a, unbiased_b, variance_b, features_b, strength),
+            fit(unbiased_b, unbiased_a, variance_a, features_a, strength),
+        )
+        for strength in strengths
+    )
+    share = _narrow_share(narrow, wide, (unbiased_b, unbiased_a), mixing)
+    a, b = (w + share * (n - w) for n, w in zip(narrow, wide, strict=True))
+    return a, b
+
+
+def _narrow_share(
+    narrow: tuple[Image, Image],
+    wide: tuple[Image, Image],
+    truth: tuple[Image, Image],
+    window: int,
+) -> Float[Array, "h w 1"]:
+    """The share s of the narrow fit with the least sum of (wide + s (n - w) - x)^2.
+
+    x is the half that was not fitted, in place of the truth; the sum is over a window,
+    both halves and all channels. Pixels are weighed by their brightness, lest fireflies
+    decide.
+    """
+    known = finite(*truth)
+    along, square = jnp.zeros_like(narrow[0][..., :1]), 0.0
+    for n, w, x in zip(narrow, wide, truth, strict=True):
+        step, gap = n - w, jnp.where(known, x - w, 0.0)
+        bright = jnp.mean(jnp.square(w), axis=-1, keepdims=True)
+        typical = jnp.mean(bright)
+        scale = jnp.where(typical > 0, bright + typical, 1.0)
+        along += jnp.sum(step * gap, axis=-1, keepdims=True) / scale
+        square += jnp.sum(jnp.square(step), axis=-1, keepdims=True) / scale
+    along, square = (
+        window_sum(jnp.asarray(i), window, mask=known) for i in (along, square)
+    )
+    inside = (along > 0) & (along < square)
+    share = divide(along, square, where=inside)
+    return jnp.where(inside, share, jnp.where(along > 0, 1.0, 0.0).astype(share.dtype))
+
+
+def pool_variance(variance: Variance) -> Variance:
+    """Sample variances pooled a little: never below the mean of their neighbours.
+
+    Args:
+        variance: of the mean, squared radiance, shape [H,W,C].
+
+    Returns:
+        the pooled variance, shape [H,W,C]; pixels that are not finite stay so.
+
+    Source: ours; a pixel that missed a rare bright path is not certain of itself.
+    """
+    near = window_mean(variance, _POOL, mask=finite(variance))
+    return jnp.maximum(variance, near)
+
+
+def filter_features(features_a: Features, features_b: Features) -> tuple[Image, Image]:
+    """Filter the noise of depth of field and motion out of both halves' features.
+
+    Args:
+        features_a: of half a, shape [H,W,F].
+        features_b: of half b, of other samples, or the same if they are free of noise.
+
+    Returns:
+        both, each by non-local means with the weights of the other.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Source: Bitterli et al. 2016, section on pre-filtering.
+    """
+    if features_a.shape[-1] == 0:
+        return features_a, features_b
+    check_same_shape(features_a=features_a, features_b=features_b)
+    square = jnp.square(features_a - features_b) / 2
+    variance = window_mean(square, _POOL, mask=finite(square))
+
+    def across(image: Image, guide: Image) -> Image:
+        return nonlocal_means.denoise(
+            image,
+            guide,
+            variance,
+            window=_FEATURE_WINDOW,
+            strength=_FEATURE_STRENGTH,
+        )
+
+    return across(features_a, features_b), across(features_b, features_a)
+
+
+# Called with values, a loop over tiles would be compiled anew each time.
+_denoise = jax.jit(denoise, static_argnames=("window", "stride"))
+_filter_features = jax.jit(filter_features)
+
+
+def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
+    """Denoise a frame from its two halves, and each half by itself if it has halves.
+
+    Leaves out features that tell nothing, so it is not for `jit`.
+
+    Args:
+        frame: with sub-buffers, and variances unless it has four or more.
+        window: width of the regression's windows in pixels, odd.
+        stride: pixels between their centres.
+
+    Returns:
+        the denoised frame; its halves if there are at least four sub-buffers.
+
+    Raises:
+        ValueError: if the frame has no sub-buffers, or no way to know the variance.
+    """
+    a, b = frame.halves()
+    stacks = stack(a), stack(b)
+    needed = select(stacks)
+    features = _filter_features(*(needed.of(s) for s in stacks))
+    both = _denoise(
+        a.color,
+        b.color,
+        a.variance,
+        b.variance,
+        *features,
+        window=window,
+        stride=stride,
+        ridge=jnp.asarray(needed.ridge(0.1), frame.color.dtype),
+    )
+    full = (both[0] + both[1]) / 2
+    if frame.sub_buffers < 4:
+        return Biased(full)
+    halves = [denoise_frame(half, window=window, stride=stride).full for half in (a, b)]
+    return Biased(full, jnp.stack(halves))

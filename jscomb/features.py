@@ -1,0 +1,108 @@
+"""Features for regression: those that a frame has, without those that tell nothing.
+
+A regression's cost falls with the square of the number of features. One that is
+constant over the frame has a slope of zero whatever the data, and equal ones share
+theirs; leaving them out changes the result by rounding only, if the one that stays
+takes the ridge divided by the number of its copies. What stays depends on values, so
+`select` is for NumPy at the edge, not for `jit`.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jscomb.frame import Frame
+from jscomb.typing import Image
+
+_ROUNDING = 1e-6  # of the largest value; what a renderer's float32 leaves of a constant
+
+
+class Selection(NamedTuple):
+    """Which channels of a stack of features a regression needs.
+
+    Attributes:
+        channels: their numbers, ascending.
+        copies: how many equal channels each of them stands for.
+    """
+
+    channels: tuple[int, ...]
+    copies: tuple[int, ...]
+
+    def of(self, features: Float[Array, "h w _"]) -> Float[Array, "h w _"]:
+        """The needed channels, [H,W,F]."""
+        return features[..., np.array(self.channels, int)]
+
+    def ridge(self, ridge: float) -> Float[np.ndarray, " _"]:
+        """The ridge of each needed channel, [F]; the same result as with its copies."""
+        return ridge / np.array(self.copies, np.float32)
+
+
+def stack(frame: Frame) -> Image:
+    """The features that a frame has, side by side.
+
+    Args:
+        frame: with any of albedo, normal, depth and visibility.
+
+    Returns:
+        the channels of those it has, in this order, shape [H,W,F], F at most 8. Depth
+        is divided by its largest finite value. F is 0 for a frame without features.
+
+    Source: NJS, section 4 (features of the regression).
+    """
+    albedo, normal, depth, visibility = (
+        frame.albedo,
+        frame.normal,
+        frame.depth,
+        frame.visibility,
+    )
+    if depth is not None:
+        farthest = jnp.max(depth, where=jnp.isfinite(depth), initial=0.0)
+        depth = depth / jnp.where(farthest > 0, farthest, 1.0)
+    given = [f for f in (albedo, normal, depth, visibility) if f is not None]
+    height, width, _ = frame.color.shape
+    none = jnp.zeros((height, width, 0), frame.color.dtype)
+    return jnp.concatenate([none, *given], axis=-1)
+
+
+def select(stacks: Sequence[Float[ArrayLike, "h w f"]]) -> Selection:
+    """Leave out channels that are constant, or equal to one before.
+
+    Args:
+        stacks: the same features of each half, shape [H,W,F] each. A channel is left
+            out only if it may be in all of them. Values that are not finite do not
+            count.
+
+    Returns:
+        what is left.
+
+    Example:
+        >>> ramp = np.linspace(0, 1, 6).reshape(2, 3)
+        >>> print(select([np.stack([ramp, ramp, 0 * ramp, -ramp], axis=-1)]))
+        Selection(channels=(0, 3), copies=(2, 1))
+    """
+    images = np.stack([np.asarray(s) for s in stacks])
+    images = np.where(np.isfinite(images).all(-1, keepdims=True), images, np.nan)
+    pixels = images.reshape(len(images), -1, images.shape[-1])
+    channels: list[int] = []
+    copies: list[int] = []
+    for number in range(pixels.shape[-1]):
+        channel = pixels[..., number]
+        if _alike(channel, np.nanmean(channel, axis=1, keepdims=True)):
+            continue
+        for place, other in enumerate(channels):
+            if _alike(channel, pixels[..., other]):
+                copies[place] += 1
+                break
+        else:
+            channels.append(number)
+            copies.append(1)
+    return Selection(tuple(channels), tuple(copies))
+
+
+def _alike(channel: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two channels differ by rounding only."""
+    largest = np.nanmax(abs(channel), initial=0.0)
+    return bool(np.nanmax(abs(channel - other), initial=0.0) <= _ROUNDING * largest)
