@@ -8,7 +8,9 @@ Each paper is one module of pure functions, and each has the verb `combine`::
     image = james_stein.combine(frame.color, denoised, frame.variance)
 """
 
+from jscomb import denoisers as denoisers
 from jscomb import exr as exr
+from jscomb import features as features
 from jscomb import frame as frame
 from jscomb import james_stein as james_stein
 from jscomb import metrics as metrics

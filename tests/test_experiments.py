@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from experiments import bundle, frames, james_stein_error, james_stein_speed
+from experiments import (
+    bundle,
+    frames,
+    james_stein_error,
+    james_stein_speed,
+    speed_error,
+)
 from jscomb import metrics
 from jscomb.cli import METHODS
 from jscomb.frame import CHANNELS
@@ -57,6 +63,22 @@ def test_every_function_is_timed():
     medians = james_stein_speed.run(james_stein_speed.Config(quick=True))
     assert {"two window sums", "combine", "combine, whitened"} < medians.keys()
     assert all(seconds > 0 for seconds in medians.values())
+
+
+def test_regression_is_measured(folder):
+    frame = frames.load(folder / "glass.npz", 64)
+    frame = frame.scaled(1 / frame.exposure)
+    found = speed_error.errors_of(frame, frame.biased["oidn"], [(4, 21)], 1)
+    r, noise = frame.reference
+    expected = metrics.rel_l2(frame.biased["oidn"].full, r, half_difference=noise)
+    np.testing.assert_allclose(found.base, expected, rtol=1e-6)
+    assert found.regressed[4, 21] > 0
+    assert found.seconds[4, 21] > 0
+    r = speed_error.WINDOW // 2
+    pairs = sum(
+        abs(a - b) <= r and abs(c - d) <= r for a, b, c, d in np.ndindex(30, 30, 30, 30)
+    )
+    assert speed_error.useful_operations(30) == 2 * 151 * pairs
 
 
 def test_a_crop_is_of_every_image(glass_frame):

@@ -31,8 +31,9 @@ from jscomb.typing import Image, Variance
 
 Features = Float[Array, "h w f"]
 
-# Of the features' pre-filter, and of the window that their variance is pooled over.
-_FEATURE_WINDOW, _FEATURE_STRENGTH, _POOL = 11, 1.0, 5
+_POOL = 3  # width that sample variances are averaged over: as they are they mislead
+_FEATURE_WINDOW, _FEATURE_STRENGTH = 11, 1.0  # of the features' pre-filter
+_LEAST = 1e-4  # of the mean square radiance; keeps black pixels from deciding
 
 
 def denoise(
@@ -87,7 +88,7 @@ def denoise(
 
     def fit(x: Image, guide: Image, v: Variance, f: Features, strength: float) -> Image:
         weights = nonlocal_means.weights(
-            guide, pool_variance(v), patch=patch, strength=strength
+            guide, window_mean(v, _POOL, mask=finite(v)), patch=patch, strength=strength
         )
         prediction, weight = joint_local_linear(
             [(x, weights)], f, window=window, stride=stride, ridge=ridge
@@ -122,9 +123,9 @@ def _narrow_share(
     along, square = jnp.zeros_like(narrow[0][..., :1]), 0.0
     for n, w, x in zip(narrow, wide, truth, strict=True):
         step, gap = n - w, jnp.where(known, x - w, 0.0)
-        bright = jnp.mean(jnp.square(w), axis=-1, keepdims=True)
-        typical = jnp.mean(bright)
-        scale = jnp.where(typical > 0, bright + typical, 1.0)
+        bright = jnp.mean(jnp.square(n), axis=-1, keepdims=True)
+        least = _LEAST * jnp.mean(bright)
+        scale = jnp.where(least > 0, bright + least, 1.0)
         along += jnp.sum(step * gap, axis=-1, keepdims=True) / scale
         square += jnp.sum(jnp.square(step), axis=-1, keepdims=True) / scale
     along, square = (
@@ -133,21 +134,6 @@ def _narrow_share(
     inside = (along > 0) & (along < square)
     share = divide(along, square, where=inside)
     return jnp.where(inside, share, jnp.where(along > 0, 1.0, 0.0).astype(share.dtype))
-
-
-def pool_variance(variance: Variance) -> Variance:
-    """Sample variances pooled a little: never below the mean of their neighbours.
-
-    Args:
-        variance: of the mean, squared radiance, shape [H,W,C].
-
-    Returns:
-        the pooled variance, shape [H,W,C]; pixels that are not finite stay so.
-
-    Source: ours; a pixel that missed a rare bright path is not certain of itself.
-    """
-    near = window_mean(variance, _POOL, mask=finite(variance))
-    return jnp.maximum(variance, near)
 
 
 def filter_features(features_a: Features, features_b: Features) -> tuple[Image, Image]:

@@ -1,0 +1,143 @@
+"""Non-local means and NFOR."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb import exr
+from jscomb.denoisers import nfor, nonlocal_means
+from jscomb.frame import make_frame
+from jscomb.metrics import rel_l2
+from tests.conftest import DATA
+
+RNG = np.random.default_rng(2)
+SIZES = {"window": 7, "patch": 3}
+means = jax.jit(nonlocal_means.denoise, static_argnames=("window", "patch", "strength"))
+
+
+def means_by_loops(image, u, v, *, window, patch, strength):
+    """Every patch of every pair of pixels, in float64."""
+    size, r, f = np.array(image.shape[:2]), window // 2, patch // 2
+    valid = np.isfinite(np.concatenate([image, u, v], -1)).all(-1)
+    inside = lambda p: (p >= 0).all() and (p < size).all() and valid[tuple(p)]
+
+    def distance(p, q):
+        p, q = tuple(p), tuple(q)
+        square = (u[p] - u[q]) ** 2 - (v[p] + np.minimum(v[p], v[q]))
+        noise = strength**2 * (v[p] + v[q])
+        far = np.where(square > 0, 1e3, 0.0)
+        near = square < 1e3 * noise
+        return np.where(near, square / np.where(noise > 0, noise, 1), far).mean()
+
+    result = np.where(np.isfinite(image).all(-1, keepdims=True), image, 0.0)
+    offsets = [np.array(o) - f for o in np.ndindex(patch, patch)]
+    for p in np.argwhere(valid):
+        total, weight = 0, 0
+        for o in np.ndindex(window, window):
+            q = p + o - r
+            if not inside(q):
+                continue
+            pairs = [(p + s, q + s) for s in offsets]
+            seen = [distance(a, b) for a, b in pairs if inside(a) and inside(b)]
+            w = np.exp(-max(0, np.mean(seen)))
+            total, weight = total + w * image[tuple(q)], weight + w
+        result[tuple(p)] = total / weight
+    return result
+
+
+def noisy(height=11, width=19):
+    """Image, guide and its variance; one pixel without variance."""
+    image, u = RNG.uniform(size=(2, height, width, 2))
+    v = RNG.uniform(0.01, 0.1, (height, width, 2))
+    v[3, 0] = 0
+    return image, u, v
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_non_local_means_are_the_loops(broken):
+    data = noisy()
+    if broken:
+        for k, bad in enumerate((np.nan, np.inf, np.nan)):
+            data[k][2 + 3 * k, 4, 0] = bad
+    expected = means_by_loops(*data, **SIZES, strength=0.7)
+    for dtype, tolerance in ((np.float64, 1e-11), (np.float32, 1e-5)):
+        arrays = [jnp.asarray(d, dtype) for d in data]
+        found = means(*arrays, **SIZES, strength=0.7)
+        np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
+    total = lambda *i: means(*i, **SIZES).sum()
+    for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(*arrays):
+        assert np.isfinite(gradient).all()
+
+
+def test_non_local_means_gradient():
+    data = [jnp.asarray(i[:5, :6]) for i in noisy()]
+    data[2] = data[2] + 0.01
+    # Short steps: each of the many pairs has a kink where its patches are alike.
+    check_grads(
+        jax.jit(lambda *i: means(*i, **SIZES)), data, order=1, modes=["rev"], eps=1e-7
+    )
+
+
+def test_non_local_means_keep_an_edge_and_clear_the_rest():
+    truth = np.zeros((24, 24, 1))
+    truth[:, 12:] = 1
+    image = jnp.asarray(truth + 0.1 * RNG.normal(size=truth.shape))
+    variance = jnp.full_like(image, 0.01)
+    error = lambda i: float(jnp.mean((i - truth) ** 2))
+    assert error(means(image, image, variance)) < 0.1 * error(image)
+
+
+def test_nothing_is_mixed_where_nothing_is_alike():
+    ramp = jnp.arange(30.0).reshape(5, 6, 1)
+    out = means(ramp, ramp, jnp.zeros_like(ramp), **SIZES)
+    np.testing.assert_allclose(out, ramp, rtol=1e-6)
+
+
+def test_nfor_lowers_the_error_of_a_real_frame():
+    box_frame = exr.read_frame(DATA / "cornell-box-64.exr")
+    reference, noise = box_frame.reference
+    error = lambda image: rel_l2(image, reference, half_difference=noise)
+    denoised = nfor.denoise_frame(box_frame)
+    assert error(denoised.full) < 0.3 * error(box_frame.color)
+    assert error(denoised.halves[0]) < 0.3 * error(box_frame.halves()[0].color)
+    for scale in (1e-6, 1e6):
+        other = nfor.denoise_frame(box_frame.scaled(scale)).full / scale
+        np.testing.assert_allclose(other, denoised.full, rtol=1e-3, atol=1e-5)
+
+
+def test_nfor_is_consistent():
+    """With ever less noise its error vanishes, even where features explain nothing."""
+    truth = RNG.uniform(0.5, 1.5, (20, 20, 3))
+    errors = []
+    for noise in (0.1, 0.01):
+        a, b = truth + noise * RNG.normal(size=(2, 20, 20, 3))
+        variance = jnp.full((20, 20, 3), noise**2)
+        none = jnp.zeros((20, 20, 0))
+        run = jax.jit(lambda *i: nfor.denoise(*i, window=7, patch=3))
+        pair = run(jnp.asarray(a), jnp.asarray(b), variance, variance, none, none)
+        errors.append(float(jnp.mean((sum(pair) / 2 - truth) ** 2)))
+    assert errors[1] < 0.02 * errors[0]
+
+
+def test_nfor_survives_bad_pixels():
+    x, f = RNG.uniform(size=(2, 2, 12, 12, 3))
+    v = np.full((2, 12, 12, 3), 0.01)
+    x[0, 3, 4], v[1, 6, 6], f[0, 9, 9] = np.nan, np.inf, np.nan
+    x[1, 5, 5] = 1e6
+    arrays = [jnp.asarray(i) for pair in (x, v, f) for i in pair]
+    run = lambda *i: nfor.denoise(*i, window=3, patch=3, mixing=5)
+    assert all(np.isfinite(i).all() for i in jax.jit(run)(*arrays))
+    total = lambda *i: sum(jnp.sum(part) for part in run(*i))
+    for gradient in jax.jit(jax.grad(total, argnums=tuple(range(6))))(*arrays):
+        assert np.isfinite(gradient).all()
+
+
+def test_frame_without_what_it_needs():
+    with pytest.raises(ValueError, match="no sub-buffers"):
+        nfor.denoise_frame(make_frame(jnp.ones((4, 4, 3))))
+    with pytest.raises(ValueError, match="strength must be positive, got 0"):
+        nonlocal_means.weights(jnp.ones((4, 4, 3)), jnp.ones((4, 4, 3)), strength=0.0)
+    with pytest.raises(ValueError, match="window must be odd"):
+        means(*map(jnp.asarray, noisy()), window=4)
