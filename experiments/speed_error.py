@@ -2,15 +2,14 @@
 
     python -m experiments.speed_error FOLDER
 
-Three tables and a plot, from the archives in the folder (see `frames`):
+Two tables and a plot:
 
-    time     of the whole regression on random images, beside its parts timed alone in
-             the same run: the weights, the products of features, both matrix products.
-             The ceiling is a plain matrix product of that shape.
-    error    of y and of y* (its mean over the halves) for each stride and window, with
-             the time of each; relative L2 less the reference's noise, at an exposure
-             of 1. The base y is Open Image Denoise, or non-local means, a weak one.
-    choice   what the halves say of y*, and what the reference says.
+    parts    seconds of one regression of random images, beside those of its parts timed
+             alone in the same run: weights, products of features, and both matrix
+             products, which are the ceiling.
+    error    of y*, made by cross-regression from Open Image Denoise, and its time, for
+             strides, windows, tile sizes and precisions; on the archives in the folder
+             (see `frames`), relative L2 less the reference's noise.
 """
 
 import dataclasses
@@ -20,6 +19,7 @@ import statistics
 import time
 from collections.abc import Callable
 from typing import NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -29,15 +29,14 @@ from matplotlib import pyplot as plt
 from tqdm import tqdm
 
 from experiments import frames
+from experiments.regression_error import inputs_of
 from jscomb import james_stein
-from jscomb.denoisers import nfor, nonlocal_means
-from jscomb.features import select, stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import regression
+from jscomb.typing import Image
 
 WINDOW, FEATURES, CHANNELS = 51, 11, 3
-SETTINGS = [(1, 51), (2, 51), (4, 51), (8, 51), (1, 31), (1, 21), (2, 21)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,8 +141,30 @@ PARTS = (
 )
 
 
+def product_operations(size: int) -> float:
+    """What the moments' matrix product executes, tiles and neighbourhoods in full.
+
+    Args:
+        size: width and height of the image in pixels.
+
+    Returns:
+        floating-point operations.
+    """
+    grid = regression._grid(WINDOW, 1)
+    n, m, p = grid.width(grid.reach) ** 2, grid.side**2, FEATURES + 1
+    turns = grid.tiles(size) ** 2 // grid.batch
+    return 2.0 * (p * (p + 1) // 2 + p * CHANNELS) * n * m * turns * grid.batch
+
+
 def useful_operations(size: int) -> float:
-    """2 (moments + predictions) for each pixel of each clipped window."""
+    """2 (moments + predictions) for each pixel of each clipped window.
+
+    Args:
+        size: width and height of the image in pixels.
+
+    Returns:
+        floating-point operations.
+    """
     p = FEATURES + 1
     columns = p * (p + 1) // 2 + p * CHANNELS + p * CHANNELS + 1
     at = np.arange(size)
@@ -152,85 +173,85 @@ def useful_operations(size: int) -> float:
     return 2.0 * columns * float(along.sum()) ** 2
 
 
-class Errors(NamedTuple):
-    """One frame with one base image.
+class Setting(NamedTuple):
+    """How to regress.
 
     Attributes:
-        base: relative L2 of y.
-        regressed: relative L2 of y* by (stride, window).
-        seconds: median time of y* by (stride, window).
-        change: estimated change of the error, with its standard error.
-        true: the change by the reference, in the same weighting.
-        dropped: features left out.
+        stride: pixels between the centres of windows.
+        window: width of the windows in pixels.
+        side: centres along one side of a tile.
+        bits: of the floating-point numbers.
     """
 
-    base: float
-    regressed: dict[tuple[int, int], float]
-    seconds: dict[tuple[int, int], float]
-    change: tuple[float, float]
-    true: float
-    dropped: int
+    stride: int = 1
+    window: int = 51
+    side: int = 16
+    bits: int = 32
+
+    def __str__(self) -> str:
+        """What differs from the first."""
+        names = {"stride": "stride", "window": "window", "side": "tile of"}
+        said = [
+            f"{names[name]} {value}"
+            for name, value in self._asdict().items()
+            if name in names and value != getattr(FIRST, name)
+        ]
+        return ", ".join(said + ["float64"] * (self.bits == 64)) or "stride 1, 51x51"
 
 
-cross = jax.jit(james_stein.cross_regression, static_argnames=("window", "stride"))
-worth = jax.jit(james_stein.worth_regressing, static_argnames=("window", "stride"))
-means = jax.jit(nonlocal_means.denoise)
+FIRST = Setting()
+SETTINGS = [
+    FIRST,
+    *(Setting(stride=s) for s in (2, 4, 8)),
+    *(Setting(window=w) for w in (31, 21)),
+    Setting(stride=2, window=21),
+    *(Setting(side=s) for s in (8, 12, 20)),
+    Setting(bits=64),
+]
 
 
-def weak_base(frame: Frame) -> Biased:
-    """Non-local means of the frame, and of each half by itself."""
-    full, *halves = (
-        means(part.color, part.color, part.variance)
-        for part in (frame, *frame.halves())
-    )
-    return Biased(full, jnp.stack(halves))
+def regressed(frame: Frame, setting: Setting, repeats: int) -> tuple[Image, float]:
+    """Regress the frame's denoised image.
 
+    Args:
+        frame: with `oidn`, at an exposure of 1.
+        setting: how.
+        repeats: timed calls.
 
-def errors_of(frame: Frame, base: Biased, settings: list, repeats: int) -> Errors:
-    """Regress one base image of a frame with every setting."""
-    assert frame.reference is not None
-    assert base.halves is not None
-    a, b = frame.halves()
-    needed = select([stack(a), stack(b)])
-    others = needed.of(stack(a)), needed.of(stack(b))
-    inputs = (a.color, b.color, *base.halves, *others)
-    r, noise = frame.reference
-    error = lambda i, epsilon: float(
-        rel_l2(i, r, half_difference=noise, epsilon=epsilon)
-    )
-    seconds = medians(
-        {
-            setting: functools.partial(
-                cross, *inputs, stride=setting[0], window=setting[1]
+    Returns:
+        y*, and the median seconds of one call.
+    """
+    inputs = inputs_of(frame, frame.biased["oidn"])
+    with (
+        jax.enable_x64(setting.bits == 64),
+        mock.patch.object(regression, "_SIDE", setting.side),
+    ):
+        dtype = jnp.float64 if setting.bits == 64 else jnp.float32
+        arrays = [jnp.asarray(np.asarray(i), dtype) for i in inputs]
+        run = jax.jit(
+            functools.partial(
+                james_stein.cross_regression,
+                stride=setting.stride,
+                window=setting.window,
             )
-            for setting in settings
-        },
-        repeats,
-    )
-    images = {(s, w): sum(cross(*inputs, stride=s, window=w)) / 2 for s, w in settings}
-    change = worth(jax.random.key(0), *inputs, a.variance, b.variance)
-    first = images[settings[0]]
-    return Errors(
-        error(base.full, 0.01),
-        {setting: error(image, 0.01) for setting, image in images.items()},
-        seconds,
-        (float(change.mean), float(change.standard_error)),
-        error(first, 1.0) - error(base.full, 1.0),
-        stack(a).shape[-1] - len(needed.channels),
-    )
+        )
+        call = lambda: run(*arrays)
+        seconds = medians({"y*": call}, repeats)["y*"]
+        return jnp.asarray(np.asarray(sum(call()) / 2), jnp.float32), seconds
 
 
-def run(
-    config: Config,
-) -> tuple[dict[str, float], dict[tuple[str, int, str], Errors], dict]:
+Results = dict[Setting, tuple[list[float], list[float]]]
+
+
+def run(config: Config) -> tuple[dict[str, float], Results]:
     """Measure everything.
 
     Args:
         config: what to measure.
 
     Returns:
-        seconds of the whole and its parts; errors by frame, sample count and base; and
-        relative L2 of path tracing and NFOR by frame and sample count.
+        seconds of the whole and its parts; and of each setting the relative L2 and the
+        seconds, both frame by frame.
 
     Raises:
         ValueError: if the folder holds no archive.
@@ -241,73 +262,78 @@ def run(
     size, repeats = (64, 1) if config.quick else (config.size, config.repeats)
     seconds = medians(parts(size), repeats)
     settings = SETTINGS[:2] if config.quick else SETTINGS
+    found: Results = {setting: ([], []) for setting in settings}
     cases = [(p, s) for p in paths for s in frames.sample_counts(p)]
-    found, others = {}, {}
     for path, samples in tqdm(cases[:1] if config.quick else cases, unit="frame"):
         frame = frames.load(path, samples)
         frame = frame.scaled(1 / frame.exposure)
         assert frame.reference is not None
-        for name, base in (
-            ("oidn", frame.biased["oidn"]),
-            ("non-local means", weak_base(frame)),
-        ):
-            found[path.stem, samples, name] = errors_of(frame, base, settings, 1)
         r, noise = frame.reference
-        images = frame.color, nfor.denoise_frame(frame).full
-        others[path.stem, samples] = [
-            float(rel_l2(i, r, half_difference=noise)) for i in images
-        ]
-    return seconds, found, others
+        for setting in settings:
+            image, time_of_one = regressed(frame, setting, 1)
+            found[setting][0].append(float(rel_l2(image, r, half_difference=noise)))
+            found[setting][1].append(time_of_one)
+    return seconds, found
 
 
-def draw(found: dict[tuple[str, int, str], Errors], path: pathlib.Path) -> None:
-    """Time of y* against its error, relative to stride 1 and window 51."""
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    cases = [e for (*_, base), e in found.items() if base == "oidn"]
-    for setting in cases[0].regressed:
-        x, y = (
-            np.exp(np.mean([np.log(of[setting] / of[SETTINGS[0]]) for of in all_]))
-            for all_ in ([e.seconds for e in cases], [e.regressed for e in cases])
+def ratios(found: Results) -> dict[str, tuple[float, float, float]]:
+    """Of each setting to the first: error, its worst, and time.
+
+    Args:
+        found: errors and seconds of each setting, frame by frame.
+
+    Returns:
+        geometric mean and greatest ratio of the errors, geometric mean of the times.
+    """
+    result = {}
+    for setting, measured in found.items():
+        error, time_of_one = (
+            np.log(each) - np.log(first)
+            for each, first in zip(measured, found[FIRST], strict=True)
         )
-        axes.plot(x, y, "o")
-        axes.annotate(f" stride {setting[0]}, {setting[1]}x{setting[1]}", (x, y))
-    axes.set(xscale="log", xlabel="time / that of stride 1, 51x51")
-    axes.set(ylabel="relative L2 / that of stride 1, 51x51")
+        means = np.exp(error.mean()), np.exp(error.max()), np.exp(time_of_one.mean())
+        result[str(setting)] = tuple(map(float, means))
+    return result
+
+
+def draw(found: Results, path: pathlib.Path) -> None:
+    """Time of y* against its error, both relative to the first setting.
+
+    Args:
+        found: errors and seconds of each setting, frame by frame.
+        path: of the picture.
+
+    Returns:
+        nothing.
+    """
+    figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    for name, (error, _, time_of_one) in ratios(found).items():
+        axes.plot(time_of_one, error, "o")
+        axes.annotate(f" {name}", (time_of_one, error), rotation=20, fontsize=8)
+    axes.set(xscale="log", xlabel="time of y* / that of stride 1, 51x51")
+    axes.set(ylabel="relative L2 of y* / that of stride 1, 51x51")
+    axes.margins(0.2)
     figure.savefig(path, dpi=120)
 
 
 def main() -> None:
     """Print the tables."""
     config = tyro.cli(Config, description=__doc__)
-    seconds, found, others = run(config)
+    seconds, found = run(config)
     size = 64 if config.quick else config.size
     print(f"\n{size}x{size}, {FEATURES} features, window {WINDOW}")
     for name, each in seconds.items():
         print(f"{name:<28}{each:>9.3f} s{1e6 * each / size**2:>9.2f} s a megapixel")
-    total = sum(seconds[name] for name in PARTS)
-    rate = useful_operations(size) / seconds["stride 1"] / 1e9
-    grid = regression._grid(WINDOW, 1)
-    n, m, p = grid.width(grid.reach) ** 2, grid.side**2, FEATURES + 1
-    executed = 2.0 * (p * (p + 1) // 2 + p * CHANNELS) * n * m
-    executed *= grid.tiles(size) ** 2 // grid.batch * grid.batch
-    ceiling = executed / seconds["moments, matrix product"] / 1e9
-    print(f"whole / sum of parts {seconds['stride 1'] / total:.2f}")
+    whole, total = seconds["stride 1"], sum(seconds[name] for name in PARTS)
+    rate = useful_operations(size) / whole / 1e9
+    ceiling = product_operations(size) / seconds["moments, matrix product"] / 1e9
+    print(f"whole / sum of parts {whole / total:.2f}")
     print(f"useful {rate:.1f} GFLOP/s of the product's {ceiling:.1f}", end="")
     print(f" = {rate / ceiling:.2f}")
-    print(f"stride 2 {seconds['stride 1'] / seconds['stride 2']:.2f} x as fast")
-    settings = list(next(iter(found.values())).regressed)
-    columns = "".join(f"{f'y* {s}, {w}':>11}" for s, w in settings)
-    print(f"\n{'frame':<13}{'spp':>5} {'base':<16}{'y':>9}{columns}  estimate; truth")
-    for (frame, samples, base), e in found.items():
-        row = "".join(f"{e.regressed[s]:>11.5f}" for s in settings)
-        mean, error = e.change
-        chosen = "regress" if mean + error < 0 else "keep"
-        print(f"{frame:<13}{samples:>5} {base:<16}{e.base:>9.5f}{row}", end="")
-        print(f"  {mean:+.5f}+-{error:.5f} {chosen:<8}{e.true:+.5f}")
-    print(f"\n{'frame':<13}{'spp':>5}{'path tracing':>14}{'NFOR':>10}{'oidn':>10}")
-    for (frame, samples), (x, y) in others.items():
-        oidn = found[frame, samples, "oidn"].base
-        print(f"{frame:<13}{samples:>5}{x:>14.5f}{y:>10.5f}{oidn:>10.5f}")
+    print(f"stride 2 is {whole / seconds['stride 2']:.2f} x as fast")
+    print(f"\n{'y* relative to the first':<28}{'error':>8}{'worst':>8}{'time':>8}")
+    for name, (error, worst, time_of_one) in ratios(found).items():
+        print(f"{name:<28}{error:>8.3f}{worst:>8.3f}{time_of_one:>8.3f}")
     if config.plot is not None:
         draw(found, config.plot)
 

@@ -8,6 +8,7 @@ from experiments import (
     frames,
     james_stein_error,
     james_stein_speed,
+    regression_error,
     speed_error,
 )
 from jscomb import metrics
@@ -65,20 +66,38 @@ def test_every_function_is_timed():
     assert all(seconds > 0 for seconds in medians.values())
 
 
-def test_regression_is_measured(folder):
+def test_regression_is_measured(folder, tmp_path):
+    config = regression_error.Config(
+        folder, tmp_path / "kept.json", stride=4, window=11, quick=True
+    )
+    found = regression_error.run(config)
+    assert found.keys() == {f"glass 64 {b}" for b in (*regression_error.BASES, "NFOR")}
+    assert regression_error.run(config) == found  # kept, and not measured again
+    row = found["glass 64 oidn"]
     frame = frames.load(folder / "glass.npz", 64)
     frame = frame.scaled(1 / frame.exposure)
-    found = speed_error.errors_of(frame, frame.biased["oidn"], [(4, 21)], 1)
     r, noise = frame.reference
     expected = metrics.rel_l2(frame.biased["oidn"].full, r, half_difference=noise)
-    np.testing.assert_allclose(found.base, expected, rtol=1e-6)
-    assert found.regressed[4, 21] > 0
-    assert found.seconds[4, 21] > 0
-    r = speed_error.WINDOW // 2
-    pairs = sum(
-        abs(a - b) <= r and abs(c - d) <= r for a, b, c, d in np.ndindex(30, 30, 30, 30)
-    )
-    assert speed_error.useful_operations(30) == 2 * 151 * pairs
+    np.testing.assert_allclose(row["y"], expected, rtol=1e-6)
+    assert row["features"] == 8
+    image, seconds = speed_error.regressed(frame, speed_error.Setting(4, 11), 1)
+    error = metrics.rel_l2(image, r, half_difference=noise)
+    np.testing.assert_allclose(row["y*"], error, rtol=1e-5)
+    assert seconds > 0
+
+
+def test_useful_operations_are_those_of_clipped_windows():
+    r, n = speed_error.WINDOW // 2, 40
+    near = abs(np.subtract.outer(np.arange(n), np.arange(n))) <= r
+    assert speed_error.useful_operations(n) == 2 * 151 * near.sum() ** 2
+
+
+def test_ratios_are_to_the_first_setting():
+    first, other = speed_error.FIRST, speed_error.Setting(stride=2)
+    found = {first: ([1.0, 2.0], [4.0, 4.0]), other: ([2.0, 1.0], [1.0, 1.0])}
+    ratios = speed_error.ratios(found)
+    assert ratios["stride 1, 51x51"] == (1, 1, 1)
+    np.testing.assert_allclose(ratios["stride 2"], (1, 2, 0.25))
 
 
 def test_a_crop_is_of_every_image(glass_frame):

@@ -2,8 +2,8 @@
 
 For work that couples each pixel with a large window and needs much memory a pixel. A
 tile is a square with some centres in it that share one neighbourhood: the square and
-`reach` pixels around it. Layout: planes [K,H,W], channels first, so that
-a pixel's neighbours in a row lie side by side.
+`reach` pixels around it. Layout: planes [K,H,W], channels first, so that a pixel's
+neighbours in a row lie side by side.
 
 Memory: besides the planes only one batch of tiles and one strip of results exist at a
 time. Reverse mode works each batch out again rather than remember it.
@@ -25,8 +25,9 @@ class Grid(NamedTuple):
     """Where the centres lie and how many share a tile.
 
     There is one centre in every square block of `stride` pixels a side. Its row in the
-    block changes with the block's column and its column with the block's row, so that
-    every line of pixels has centres, and a thin edge is not missed.
+    block changes with the block's column and its column with the block's row: on a
+    regular grid most lines of pixels would have no centre, and a thin edge could lie
+    between them.
 
     Attributes:
         side: blocks along one side of a tile.
