@@ -210,6 +210,20 @@ SETTINGS = [
 ]
 
 
+@functools.cache
+def compiled(setting: Setting) -> Callable:
+    """Cross-regression with this setting; traced where its tile size is in force.
+
+    Args:
+        setting: how.
+
+    Returns:
+        the jitted function.
+    """
+    options = {"stride": setting.stride, "window": setting.window}
+    return jax.jit(functools.partial(james_stein.cross_regression, **options))
+
+
 def regressed(frame: Frame, setting: Setting, repeats: int) -> tuple[Image, float]:
     """Regress the frame's denoised image.
 
@@ -228,13 +242,7 @@ def regressed(frame: Frame, setting: Setting, repeats: int) -> tuple[Image, floa
     ):
         dtype = jnp.float64 if setting.bits == 64 else jnp.float32
         arrays = [jnp.asarray(np.asarray(i), dtype) for i in inputs]
-        run = jax.jit(
-            functools.partial(
-                james_stein.cross_regression,
-                stride=setting.stride,
-                window=setting.window,
-            )
-        )
+        run = compiled(setting)
         call = lambda: run(*arrays)
         seconds = medians({"y*": call}, repeats)["y*"]
         return jnp.asarray(np.asarray(sum(call()) / 2), jnp.float32), seconds

@@ -16,7 +16,7 @@ how alike the pixels of y_b are,
 and likewise y^_b; their mean y* = (y^_a + y^_b) / 2 is the new biased image. Target and
 guide are independent, so the fit does not follow the noise.
 
-Away from the paper, all measured (see `experiments/speed_error.py`): the constant has
+Away from the paper, all measured (`experiments/regression_error.py`): the constant has
 no ridge; where the windows hardly speak for a pixel it fades to y instead of falling;
 and kappa is a median, because the mean over a frame is that of its light sources' edges
 and leaves no edge elsewhere. `guide_noise(..., robust=False)` gives the paper's.
@@ -71,7 +71,7 @@ def cross_regression(
         features_a: the other features of half a, shape [H,W,F]; F may be 0.
         features_b: of half b, likewise.
         window: width of the windows in pixels, odd.
-        stride: pixels between the centres of windows; 2 is 2.5 times as fast.
+        stride: pixels between the centres of windows; 2 is 2.6 times as fast.
         kappa: squared noise of the guide; None for `guide_noise` of the halves.
         epsilon: added to the bandwidth, squared radiance.
         ridge: of the regression, one number or one for each of the C+F features.
