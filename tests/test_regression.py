@@ -7,7 +7,8 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb.numerics import regression
-from jscomb.numerics.regression import gaussian_weights, joint_local_linear
+from jscomb.numerics.regression import joint_local_linear
+from jscomb.numerics.weights import gaussian_weights
 
 RNG = np.random.default_rng(0)
 

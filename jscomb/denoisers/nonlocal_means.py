@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
-from jscomb.numerics.regression import Weights
-from jscomb.numerics.tiles import Grid, Planes, Region, sum_over_tiles
+from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
+from jscomb.numerics.weights import Weights
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image
 
@@ -75,8 +75,7 @@ def denoise(
     def mean(near: Planes, seen: Planes) -> Planes:
         """Sums over the windows of a tile: of the image and of the weights."""
         w = kernel.function(seen, grid)
-        flat = near.reshape(near.shape[0], near.shape[1] * near.shape[2])
-        total = jnp.einsum("kn,mn->km", flat, w, precision="highest")
+        total = jnp.einsum("kn,mn->km", flat(near), w, precision="highest")
         return total.reshape(-1, _TILE, _TILE)
 
     taken = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)

@@ -3,4 +3,5 @@
 from jscomb.numerics import guards as guards
 from jscomb.numerics import regression as regression
 from jscomb.numerics import tiles as tiles
+from jscomb.numerics import weights as weights
 from jscomb.numerics import windows as windows

@@ -34,7 +34,7 @@ Sources:
     and for the predictions' mean. The tiles and the closed form are ours.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -44,7 +44,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, finite
-from jscomb.numerics.tiles import Grid, Planes, Region, sum_over_tiles
+from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
+from jscomb.numerics.weights import Weights, gaussian_weights
 from jscomb.numerics.windows import check_window, window_max, window_min
 from jscomb.typing import Image, Mask, Scalar
 
@@ -65,22 +66,6 @@ class LocalFit(NamedTuple):
 
     prediction: Image
     weight: Float[Array, "h w 1"]
-
-
-class Weights(NamedTuple):
-    """How each window weighs its pixels.
-
-    Attributes:
-        image: what the weights are made from, [H,W,K].
-        function: planes of a tile's neighbourhood, [K,n,n], to weights [M,N] of its
-            centres and pixels, finite and at least zero whatever the planes hold. The
-            grid tells where the centres are.
-        halo: pixels around the neighbourhood that `function` sees besides.
-    """
-
-    image: Float[Array, "h w k"]
-    function: Callable[[Planes, Grid], Float[Array, "m n"]]
-    halo: int = 0
 
 
 def local_linear(
@@ -198,7 +183,7 @@ def joint_local_linear(
             for kernel, plane in zip(kernels, planes[len(targets) :], strict=True)
         ]
         moments = [
-            jnp.einsum("pn,mn->pm", _products(basis, _flat(t)), w, precision="highest")
+            jnp.einsum("pn,mn->pm", _products(basis, flat(t)), w, precision="highest")
             for t, w in zip(planes[: len(targets)], weights, strict=False)
         ]
         # Without a moment a centre predicts 0, and nothing differentiates its rounding.
@@ -226,59 +211,6 @@ def joint_local_linear(
     return LocalFit(divide(total, spoken, where=spoken > least), weight)
 
 
-def gaussian_weights(
-    guide: Float[Array, "h w g"], bandwidth: Float[Array, "h w 1"] | Scalar | float
-) -> Weights:
-    """Weights exp(-|g_i - g_c|^2 / h).
-
-    Args:
-        guide: g, shape [H,W,G].
-        bandwidth: h > 0, unit of the guide squared: one number, or shape [H,W,1] for
-            the mean of both pixels' values. Elsewhere pixels are invalid.
-
-    Returns:
-        the weights.
-
-    Raises:
-        ValueError: if the bandwidth is a number that is not positive.
-
-    Source: NJS eq. 11 (one bandwidth), DSC eq. 12 (one a pixel).
-    """
-    if isinstance(bandwidth, int | float) and not bandwidth > 0:
-        raise ValueError(f"bandwidth must be positive, got {bandwidth}")
-    h = jnp.asarray(bandwidth, guide.dtype)
-    h = jnp.where(h > 0, h, jnp.nan)
-    if h.ndim == 0:  # divided by once a pixel, not once a weight
-        return Weights(guide / jnp.sqrt(h), _gaussian)
-    return Weights(jnp.concatenate([guide, h], axis=-1), _gaussian_of_both)
-
-
-def _gaussian(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """exp(-|p_i - p_c|^2)."""
-    return jnp.exp(-_square_distance(planes, grid))
-
-
-def _gaussian_of_both(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """The same with the mean of both pixels' bandwidths, the last plane."""
-    h = jnp.where(planes[-1:] > 0, planes[-1:], 1.0)
-    (near,), (centre,) = _flat(h), grid.centres(h)
-    square = _square_distance(planes[:-1], grid)
-    return jnp.exp(-2 * square / (near[None] + centre[:, None]))
-
-
-def _square_distance(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """|p_i - p_c|^2; not expanded into products, which would cancel."""
-    pairs = zip(_flat(planes), grid.centres(planes), strict=True)
-    zero = jnp.zeros((), planes.dtype)
-    return sum((jnp.square(near[None] - c[:, None]) for near, c in pairs), start=zero)
-
-
-def _flat(planes: Planes) -> Float[Array, "k n"]:
-    """Pixels along one axis."""
-    count, height, width = planes.shape
-    return planes.reshape(count, height * width)
-
-
 def _centred(basis: Planes, grid: Grid) -> tuple[Float[Array, "p n"], Array]:
     """1 and features from a common origin, 0 at invalid pixels; the valid centres.
 
@@ -291,8 +223,8 @@ def _centred(basis: Planes, grid: Grid) -> tuple[Float[Array, "p n"], Array]:
     distance = distance.astype(basis.dtype)
     origin = centres[:, jnp.argmin(jnp.where(valid, distance, np.inf))]
     origin = lax.stop_gradient(origin).at[0].set(0.0)
-    flat = _flat(basis)
-    return flat - origin[:, None] * flat[:1], valid
+    pixels = flat(basis)
+    return pixels - origin[:, None] * pixels[:1], valid
 
 
 def _products(

@@ -66,9 +66,9 @@ class Grid(NamedTuple):
 
     def centres(self, planes: Planes) -> Float[Array, "k m"]:
         """What a tile's centres have, of any of its regions."""
-        count, size, _ = planes.shape
+        size = planes.shape[1]
         rows, columns = self.places + (size - self.step) // 2
-        return planes.reshape(count, size * size)[:, rows * size + columns]
+        return flat(planes)[:, rows * size + columns]
 
 
 class Region(NamedTuple):
@@ -140,6 +140,19 @@ def sum_over_tiles(
     sums = lax.map(jax.checkpoint(strip), jnp.arange(rows))
     total = _paste(sums, grid.step, (rows - 1) * grid.step + size, axis=1)
     return total[:, reach : reach + height, reach : reach + width]
+
+
+def flat(planes: Planes) -> Float[Array, "k n"]:
+    """Planes with their pixels along one axis.
+
+    Args:
+        planes: shape [K,H,W].
+
+    Returns:
+        shape [K,H*W], row by row.
+    """
+    count, height, width = planes.shape
+    return planes.reshape(count, height * width)
 
 
 def _padded(region: Region, grid: Grid, columns: int) -> Planes:
