@@ -42,6 +42,10 @@ from jscomb.typing import Image, Key, Scalar, Variance
 
 Features = Float[Array, "h w f"]
 
+# NJS's constants, and our fall back; said once, so that what `worth_regressing` judges
+# is what `cross_regression` does.
+_EPSILON, _RIDGE, _SCALE_FLOOR, _FALL_BACK = 0.01, 0.1, 0.1, 0.1
+
 
 def cross_regression(
     unbiased_a: Image,
@@ -54,10 +58,10 @@ def cross_regression(
     window: int = 51,
     stride: int = 1,
     kappa: Scalar | float | None = None,
-    epsilon: float = 0.01,
-    ridge: Float[Array, " _"] | float = 0.1,
-    scale_floor: float = 0.1,
-    fall_back: float = 0.1,
+    epsilon: float = _EPSILON,
+    ridge: Float[Array, " _"] | float = _RIDGE,
+    scale_floor: float = _SCALE_FLOOR,
+    fall_back: float = _FALL_BACK,
 ) -> tuple[Image, Image]:
     """Fit each half's unbiased image to the other half's biased image and features.
 
@@ -205,7 +209,7 @@ def worth_regressing(
     *,
     window: int = 51,
     stride: int = 4,
-    ridge: Float[Array, " _"] | float = 0.1,
+    ridge: Float[Array, " _"] | float = _RIDGE,
     epsilon: Scalar | float = 1.0,
 ) -> Change:
     """Estimate from the halves whether regression lowers the error of the whole frame.
@@ -252,8 +256,8 @@ def worth_regressing(
         variance_a=variance_a,
         variance_b=variance_b,
     )
-    bandwidth = 2 * guide_noise(biased_a, biased_b) + 0.01
-    options = _Options(bandwidth, window, stride, ridge, 0.1, 0.1)
+    bandwidth = 2 * guide_noise(biased_a, biased_b) + _EPSILON
+    options = _Options(bandwidth, window, stride, ridge, _SCALE_FLOOR, _FALL_BACK)
 
     def fit(key: Key, x: Image, v: Variance, guide: Image, features: Features):
         """The prediction, and an estimate of v_i dy^_i / dx_i."""
@@ -325,7 +329,7 @@ def regress(
     xa, xb, ya, yb = (i / exposure for i in (a.color, b.color, *halves))
     fa, fb = (needed.of(stack(half)) for half in (a, b))
     # The biased image's own channels come first.
-    ridges = np.append(np.full(xa.shape[-1], 0.1), needed.ridge(0.1))
+    ridges = np.append(np.full(xa.shape[-1], _RIDGE), needed.ridge(_RIDGE))
     options = {"window": window, "ridge": jnp.asarray(ridges, xa.dtype)}
     va, vb = (v / jnp.square(exposure) for v in (_variance(a, b), _variance(b, a)))
     change = _worth_regressing(key, xa, xb, ya, yb, fa, fb, va, vb, **options)
