@@ -14,6 +14,7 @@ Two tables and a plot:
 
 import dataclasses
 import functools
+import itertools
 import pathlib
 import statistics
 import time
@@ -317,12 +318,12 @@ def draw(found: Results, path: pathlib.Path) -> None:
         nothing.
     """
     figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    markers = itertools.cycle("osD")  # names at the points would hide each other
     for name, (error, _, time_of_one) in ratios(found).items():
-        axes.plot(time_of_one, error, "o")
-        axes.annotate(f" {name}", (time_of_one, error), rotation=20, fontsize=8)
+        axes.plot(time_of_one, error, next(markers), label=name)
+    figure.legend(loc="outside right upper")
     axes.set(xscale="log", xlabel="time of y* / that of stride 1, 51x51")
     axes.set(ylabel="relative L2 of y* / that of stride 1, 51x51")
-    axes.margins(0.2)
     figure.savefig(path, dpi=120)
 
 
