@@ -172,11 +172,16 @@ def main() -> None:
         rows = [row for name, row in found.items() if name.endswith(base)]
         ratios = [np.log(row["y*"] / row["y"]) for row in rows]
         print(f"{base}: y* / y {np.exp(np.mean(ratios)):.3f} (geometric mean)", end="")
-        helped = [row["change"] < 0 for row in rows]
         chosen = [row["estimate"] + row["standard error"] < 0 for row in rows]
-        right = sum(a == b for a, b in zip(helped, chosen, strict=True))
-        harm = sum(b and not a for a, b in zip(helped, chosen, strict=True))
-        print(f"; chosen right {right} of {len(rows)}, to its harm {harm}")
+        for epsilon, helped in {
+            "1": [row["change"] < 0 for row in rows],
+            "0.01": [row["y*"] < row["y"] for row in rows],
+        }.items():
+            right = sum(a == b for a, b in zip(helped, chosen, strict=True))
+            harm = sum(b and not a for a, b in zip(helped, chosen, strict=True))
+            print(f"; by epsilon {epsilon} right {right} of {len(rows)}", end="")
+            print(f", to its harm {harm}", end="")
+        print()
 
 
 if __name__ == "__main__":

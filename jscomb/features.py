@@ -68,12 +68,12 @@ def stack(frame: Frame) -> Image:
 
 
 def select(stacks: Sequence[Float[ArrayLike, "h w f"]]) -> Selection:
-    """Leave out channels that are constant, or equal to one before.
+    """Leave out channels that are constant, missing, or equal to one before.
 
     Args:
         stacks: the same features of each half, shape [H,W,F] each. A channel is left
-            out only if it may be in all of them. Values that are not finite do not
-            count.
+            out only if it is constant in all of them, or without any finite value in
+            one. Otherwise pixels that are not finite do not count.
 
     Returns:
         what is left.
@@ -84,13 +84,17 @@ def select(stacks: Sequence[Float[ArrayLike, "h w f"]]) -> Selection:
         Selection(channels=(0, 3), copies=(2, 1))
     """
     images = np.stack([np.asarray(s) for s in stacks])
-    images = np.where(np.isfinite(images).all(-1, keepdims=True), images, np.nan)
-    pixels = images.reshape(len(images), -1, images.shape[-1])
+    finite = np.isfinite(images)
+    present = np.flatnonzero(finite.any(axis=(1, 2)).all(axis=0))
+    known = finite[..., present].all(-1, keepdims=True)
+    images = np.where(known, images, np.nan)
+    count, height, width, all_ = images.shape
+    pixels = images.reshape(count, height * width, all_)
     channels: list[int] = []
     copies: list[int] = []
-    for number in range(pixels.shape[-1]):
+    for number in map(int, present):
         channel = pixels[..., number]
-        if _alike(channel, np.nanmean(channel, axis=1, keepdims=True)):
+        if _alike(channel, np.nanmax(channel, axis=1, keepdims=True, initial=-np.inf)):
             continue
         for place, other in enumerate(channels):
             if _alike(channel, pixels[..., other]):

@@ -92,6 +92,18 @@ def test_a_bad_pixel_stays_local(stride):
         np.testing.assert_allclose(hit[6, 7], expected[6, 7], rtol=1e-12)
         np.testing.assert_allclose(a[14:, 14:], clean[0][14:, 14:], rtol=1e-12)
         assert all(np.isfinite(g).all() for g in gradient(*images))
+        if which < 2:
+            bare = cross(*images, **options, fall_back=0.0)
+            np.testing.assert_allclose(bare[which][6, 7], expected[6, 7], rtol=1e-12)
+
+
+def test_the_decision_has_derivatives_where_the_variance_is_zero():
+    *images, v = *halves_of((8, 8)), jnp.zeros((8, 8, 3))
+    worth = lambda v: james_stein.worth_regressing(
+        jax.random.key(0), *images, v, v, window=5, stride=1
+    )
+    change, slope = jax.jit(lambda v: jax.jvp(worth, (v,), (jnp.ones_like(v),)))(v)
+    assert np.isfinite([*change, *slope]).all()
 
 
 def test_gradients():
@@ -151,6 +163,8 @@ def test_features_of_a_frame():
     full = features.stack(make_frame(color, depth=depth, albedo=jnp.ones((3, 4, 3))))
     assert full.shape == (3, 4, 4)
     assert jnp.max(full[1:, :, 3]) == 1
+    missing = full.at[..., 1].set(jnp.nan)
+    assert features.select([full, missing]).channels == (3,)
     one_differs = [jnp.ones((3, 4, 1)), jnp.arange(12.0).reshape(3, 4, 1)]
     assert features.select(one_differs).channels == (0,)
 
@@ -203,6 +217,13 @@ def test_regress_is_scale_equivariant():
         np.testing.assert_allclose(other.change.mean, one.change.mean, rtol=1e-6)
 
 
+def test_regress_with_few_features_and_narrow_windows():
+    frame = textured(0.1)
+    bare = frame._replace(buffers=frame.buffers._replace(albedo=None))
+    done = james_stein.regress(jax.random.key(0), bare, "blurred", window=3)
+    assert np.isfinite(done.change.mean)
+
+
 def test_regress_without_given_variance():
     frame = textured(0.1)
     frame = frame._replace(buffers=frame.buffers._replace(variance=None))
@@ -216,5 +237,9 @@ def test_bad_input():
         james_stein.cross_regression(*images[:3], images[3][:5], *images[4:])
     with pytest.raises(ValueError, match=r"features_b has shape \(10, 11, 1\)"):
         james_stein.cross_regression(*images[:5], images[5][..., :1])
+    with pytest.raises(ValueError, match=r"features_b has shape \(9, 11, 2\)"):
+        james_stein.worth_regressing(
+            jax.random.key(0), *images[:5], images[5][:9], *images[:2]
+        )
     with pytest.raises(ValueError, match="no biased image 'oidn' with halves"):
         james_stein.regress(jax.random.key(0), textured(0.1), "oidn")

@@ -27,8 +27,8 @@ def means_by_loops(image, u, v, *, window, patch, strength):
         p, q = tuple(p), tuple(q)
         square = (u[p] - u[q]) ** 2 - (v[p] + np.minimum(v[p], v[q]))
         noise = strength**2 * (v[p] + v[q])
-        far = np.where(square > 0, 1e3, 0.0)
-        near = square < 1e3 * noise
+        far = np.where(square > 0, 1e6, 0.0)
+        near = square < 1e6 * noise
         return np.where(near, square / np.where(noise > 0, noise, 1), far).mean()
 
     result = np.where(np.isfinite(image).all(-1, keepdims=True), image, 0.0)
@@ -121,6 +121,35 @@ def test_nfor_is_consistent():
     assert errors[1] < 0.02 * errors[0]
 
 
+def test_a_pixel_unlike_in_one_channel_is_kept():
+    """However few of a patch's values differ, if they do so beyond the noise."""
+    image = np.full((14, 14, 3), 0.5)
+    image[6, 7, 0] = 5
+    f = np.zeros((14, 14, 8))
+    f[6, 7, 2] = 1
+    filtered, _ = jax.jit(nfor.filter_features)(jnp.asarray(f), jnp.asarray(f))
+    np.testing.assert_allclose(filtered, f, atol=1e-6)
+    a, b = image + 1e-3 * RNG.normal(size=(2, *image.shape))
+    v, none = jnp.full_like(image, 1e-6), jnp.zeros((14, 14, 0))
+    run = jax.jit(lambda a, b: nfor.denoise(a, b, v, v, none, none, window=7))
+    pair = run(jnp.asarray(a), jnp.asarray(b))
+    np.testing.assert_allclose((pair[0] + pair[1]) / 2, image, atol=0.02)
+
+
+def test_nfor_of_a_bare_frame():
+    """No features; halves as soon as each has what it needs; one bad pixel."""
+    color = RNG.uniform(0.5, 1, (8, 9, 10, 3))
+    color[0, 4, 4] = np.nan
+    run = lambda frame: nfor.denoise_frame(frame, window=3)
+    eight = run(make_frame(color))
+    assert eight.halves.shape == (2, 9, 10, 3)
+    assert run(make_frame(color[:4])).halves is None
+    given = make_frame(color[:4], variance=np.full((4, 9, 10, 3), 0.01))
+    assert run(given).halves is not None
+    good_half = color[4:, 4, 4].mean(axis=0)
+    np.testing.assert_allclose(eight.full[4, 4], good_half, rtol=1e-6)
+
+
 def test_nfor_survives_bad_pixels():
     x, f = RNG.uniform(size=(2, 2, 12, 12, 3))
     v = np.full((2, 12, 12, 3), 0.01)
@@ -134,10 +163,13 @@ def test_nfor_survives_bad_pixels():
         assert np.isfinite(gradient).all()
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_frame_without_what_it_needs():
     with pytest.raises(ValueError, match="no sub-buffers"):
         nfor.denoise_frame(make_frame(jnp.ones((4, 4, 3))))
     with pytest.raises(ValueError, match="strength must be positive, got 0"):
         nonlocal_means.weights(jnp.ones((4, 4, 3)), jnp.ones((4, 4, 3)), strength=0.0)
+    with pytest.raises(ValueError, match=r"guide has shape \(5, 4, 3\), image has"):
+        means(jnp.ones((4, 4, 3)), jnp.ones((5, 4, 3)), jnp.ones((5, 4, 3)))
     with pytest.raises(ValueError, match="window must be odd"):
         means(*map(jnp.asarray, noisy()), window=4)

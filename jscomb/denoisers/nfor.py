@@ -72,7 +72,8 @@ def denoise(
 
     Returns:
         both halves denoised, [H,W,C] each; they share their inputs, and their mean is
-        the denoised image. At an invalid pixel the half itself if finite, else 0.
+        the denoised image. At an invalid pixel the half itself if finite, else the
+        other half, else 0.
 
     Raises:
         ValueError: while tracing, if shapes differ or a width is even.
@@ -93,7 +94,7 @@ def denoise(
         prediction, weight = joint_local_linear(
             [(x, weights)], f, window=window, stride=stride, ridge=ridge
         )
-        return jnp.where(weight > 0, prediction, first_finite(x))
+        return jnp.where(weight > 0, prediction, first_finite(x, guide))
 
     narrow, wide = (
         (
@@ -180,16 +181,25 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
     Leaves out features that tell nothing, so it is not for `jit`.
 
     Args:
-        frame: with sub-buffers, and variances unless it has four or more.
+        frame: with two sub-buffers and their variances, or with four or more.
         window: width of the regression's windows in pixels, odd.
         stride: pixels between their centres.
 
     Returns:
-        the denoised frame; its halves if there are at least four sub-buffers.
+        the denoised frame; and its halves, if each of them is a frame that could be
+        denoised by itself: with four sub-buffers and variances, or eight or more.
 
     Raises:
         ValueError: if the frame has no sub-buffers, or no way to know the variance.
     """
+    one = lambda part: _denoise_whole(part, window, stride)
+    if frame.sub_buffers < (8 if frame.buffers.variance is None else 4):
+        return Biased(one(frame))
+    return Biased(one(frame), jnp.stack([one(half) for half in frame.halves()]))
+
+
+def _denoise_whole(frame: Frame, window: int, stride: int) -> Image:
+    """A frame from its two halves."""
     a, b = frame.halves()
     stacks = stack(a), stack(b)
     needed = select(stacks)
@@ -204,8 +214,4 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
         stride=stride,
         ridge=jnp.asarray(needed.ridge(0.1), frame.color.dtype),
     )
-    full = (both[0] + both[1]) / 2
-    if frame.sub_buffers < 4:
-        return Biased(full)
-    halves = [denoise_frame(half, window=window, stride=stride).full for half in (a, b)]
-    return Biased(full, jnp.stack(halves))
+    return (both[0] + both[1]) / 2

@@ -30,9 +30,9 @@ from jscomb.numerics.weights import Weights
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image
 
-# A single pixel's distance at most, so that one of variance 0 does not decide alone
-# how a patch of 49 looks.
-_FARTHEST = 1e3
+# A single pixel's distance at most: finite where the variance is 0, yet enough to keep
+# two patches apart that differ in one channel of one pixel.
+_FARTHEST = 1e6
 _TILE, _TILES = 16, 4
 
 
@@ -64,6 +64,8 @@ def denoise(
     Raises:
         ValueError: while tracing, if shapes differ or a width is even.
     """
+    if image.shape[:2] != guide.shape[:2]:
+        raise ValueError(f"guide has shape {guide.shape}, image has {image.shape}")
     kernel = weights(guide, variance, patch=patch, strength=strength)
     valid = finite(image, kernel.image)
     reach = check_window(window) // 2

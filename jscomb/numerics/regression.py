@@ -25,8 +25,9 @@ with C_w(p, q) = sum_i w_ci (p_i - mean_w(p)) (q_i - mean_w(q)).
 Fast, because the M centres of a tile (see `tiles`) share a neighbourhood of N pixels.
 With W [M,N] their weights and Phi the products of features and targets, [moments,N],
 Phi W' holds all moments of all windows; with B [.., M] the coefficients, B W holds all
-predictions. Features are taken from those of one pixel that lies in all windows of the
-tile, so no moment is large beside the square of s, and float32 suffices.
+predictions. Features are taken from those of one pixel in the tile's middle, which lies
+in all of its windows, so no moment is large beside the square of s, and float32
+suffices.
 
 Sources:
     B. Moon, N. Carr, S.-E. Yoon, "Adaptive rendering based on weighted local
@@ -81,9 +82,9 @@ def local_linear(
 ) -> LocalFit:
     """Fit a linear model of the features in every window; average the predictions.
 
-    Pure, and differentiable in every array. Costs about 300 (51x51) times the window's
-    pixels in operations a pixel for eleven features; falls with the square of their
-    number and of the stride. Memory does not depend on the window.
+    Pure, and differentiable in every array. With eleven features it executes about 500
+    operations for each pixel of each window. Strides of 2, 4 and 8 are 2.6, 5 and 9
+    times as fast (51x51, two cores). Memory does not depend on the window.
 
     Args:
         target: t, any unit, shape [H,W,C].
@@ -93,8 +94,8 @@ def local_linear(
             the mean of both pixels' values. Where it is not positive the pixel is
             invalid.
         window: width of the windows in pixels, odd.
-        stride: pixels between the centres of windows, along both axes; at most
-            `window`, so that every pixel lies in one.
+        stride: pixels between the centres of windows, along both axes; at most half the
+            window. Above 1 a pixel at the border may lie in no window.
         ridge: > 0, added to the diagonal for each scaled feature: one number or one a
             feature, shape [F].
         scale_floor: > 0, unit of the features; one that varies less than this is held
@@ -307,12 +308,20 @@ def _inside(grid: Grid) -> np.ndarray:
 
 
 def _grid(window: int, stride: int) -> Grid:
-    """Tiles small enough that the middle one of their centres is in all windows."""
+    """Tiles of which the middle lies in all windows.
+
+    With a quarter of the reach to spare, for when the pixel in the middle is invalid.
+    """
     reach = check_window(window) // 2
-    if not 1 <= stride <= window:
-        raise ValueError(f"stride must be from 1 to the window {window}, got {stride}")
-    side = max(1, min(_SIDE, _STEP // stride, 2 * reach // stride + 1))
-    return Grid(side, stride, reach, batch=max(1, _CENTRES // side**2))
+    most = reach + 1
+    if not 1 <= stride <= most:
+        raise ValueError(f"stride must be from 1 to {most} for {window=}, got {stride}")
+    side = max(1, min(_SIDE, _STEP // stride))
+    while (grid := Grid(side, stride, reach, max(1, _CENTRES // side**2))).side > 1:
+        if np.ptp(grid.places, axis=1).max() <= 1.5 * reach:
+            break
+        side -= 1
+    return grid
 
 
 def _check(

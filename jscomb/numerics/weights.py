@@ -44,13 +44,16 @@ def gaussian_weights(
         the weights.
 
     Raises:
-        ValueError: if the bandwidth is a number that is not positive.
+        ValueError: if the bandwidth is a number that is not positive, or its shape is
+            not [H,W,1].
 
     Source: NJS eq. 11 (one bandwidth), DSC eq. 12 (one a pixel).
     """
     if isinstance(bandwidth, int | float) and not bandwidth > 0:
         raise ValueError(f"bandwidth must be positive, got {bandwidth}")
     h = jnp.asarray(bandwidth, guide.dtype)
+    if h.ndim and h.shape != (*guide.shape[:2], 1):
+        raise ValueError(f"bandwidth has shape {h.shape}, guide has {guide.shape}")
     h = jnp.where(h > 0, h, jnp.nan)
     if h.ndim == 0:  # divided by once a pixel, not once a weight
         return Weights(guide / jnp.sqrt(h), _gaussian)
