@@ -282,6 +282,8 @@ def _parse() -> Callable[[], None]:
 
 def _use_compilation_cache() -> None:
     """Keep compiled programs in the user's cache, so the second run starts fast."""
+    if jax.__version_info__ < (0, 10, 2):
+        return  # it would complain of every program that it finds there
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         folder = os.path.join(cache, "jscomb", "xla")
