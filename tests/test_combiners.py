@@ -5,14 +5,30 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import james_stein
+from jscomb import ensemble, james_stein
 from jscomb.cli import METHODS
+from jscomb.denoisers import smoothing
+
+
+def ensemble_of(x, y, v, **options):
+    """Of x, y and a blurred y; halves that differ by the noise v tells of."""
+    noise = jnp.sqrt(jnp.where(v > 0, v, 1e-12 * x**2 + 1e-30)) * (
+        1 + 0.1 * y / (y + x)
+    )
+    bases = lambda sign: jnp.stack([x + sign * noise, y, smoothing.box(y, window=3)])
+    halves = bases(1), bases(-1), x + noise, x - noise
+    return ensemble.combine(bases(0), *halves, **options)
+
 
 COMBINERS = {
     "james_stein": james_stein.combine,
     "james_stein whitened": lambda x, y, v: james_stein.combine(x, y, v, whiten=True),
     "james_stein dual": lambda x, y, v: james_stein.combine_dual(
         x, 2 * x - y, y, (x + y) / 2, v
+    ),
+    "ensemble": lambda x, y, v: ensemble_of(x, y, v),
+    "ensemble multi-scale": lambda x, y, v: ensemble_of(
+        x, y, v, solver="multi-scale", windows=(7, 11)
     ),
     **{f"command, {name}": method for name, method in METHODS.items()},
 }

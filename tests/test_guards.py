@@ -55,6 +55,8 @@ def test_shapes_are_named():
 def test_this_jax_adds_up():
     """Compiled sums of large arrays: one release of JAX gets them wrong on CPUs."""
     rng = np.random.default_rng(0)
-    t, u = (rng.normal(size=s).astype(np.float32) for s in ((3, 40_000), (3, 2, 40_000)))
+    t, u = (
+        rng.normal(size=s).astype(np.float32) for s in ((3, 40_000), (3, 2, 40_000))
+    )
     found = jax.jit(lambda t, u: jnp.sum(t[:, None] * u, axis=0))(t, u)
     np.testing.assert_allclose(found, (t[:, None] * u).sum(axis=0), atol=1e-5)

@@ -20,6 +20,7 @@ ROOMS = [
     "features",
     "metrics",
     "james_stein",
+    "ensemble",
     "denoisers",
     "exr",
     "plots",
@@ -27,7 +28,7 @@ ROOMS = [
     "__main__",
     "jscomb",
 ]
-COMBINERS = {"james_stein"}
+COMBINERS = {"james_stein", "ensemble"}
 ROOT = pathlib.Path(__file__).parents[1]
 MODULES = [
     importlib.import_module(m.name)

@@ -44,6 +44,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jscomb.numerics import cholesky
 from jscomb.numerics.guards import check_same_shape, divide, finite
 from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
 from jscomb.numerics.weights import Weights, gaussian_weights
@@ -255,33 +256,9 @@ def _coefficients(
     spread = spread / (scale[:, None] * scale[None])
     ridge = (ridges[None] * jnp.eye(p - 1, dtype=ridges.dtype))[..., None]
     shared = (ft[1:] - ff[0, 1:, None] * mean_t[None]) / scale[:, None]
-    slopes = _solve(spread + ridge, shared, ridges) / scale[:, None]
+    slopes = cholesky.solve(spread + ridge, shared, ridges[:, None]) / scale[:, None]
     constant = mean_t - jnp.sum(slopes * mean_f[:, None], axis=0)
     return jnp.concatenate([constant, slopes.reshape(-1, m)])
-
-
-def _solve(
-    matrix: Float[Array, "f f m"],
-    right: Float[Array, "f c m"],
-    least: Float[Array, " f"],
-) -> Float[Array, "f c m"]:
-    """M systems at once by Cholesky; matrices and right sides are reduced together.
-
-    A pivot of a covariance plus a ridge is never below the ridge but by rounding.
-    """
-    f = len(matrix)
-    rest = jnp.concatenate([matrix, jnp.moveaxis(right, 1, 0)])
-    columns = []
-    for k in range(f):
-        column = rest[:, 0] * lax.rsqrt(jnp.maximum(rest[:1, 0], least[k]))
-        columns.append(column)
-        rest = rest[1:, 1:] - column[1:, None] * column[None, 1 : f - k]
-    solution = jnp.zeros_like(right)
-    for k in reversed(range(f)):
-        diagonal, below, reduced = jnp.split(columns[k], [1, f - k])
-        known = jnp.sum(below[:, None] * solution[k + 1 :], axis=0)
-        solution = solution.at[k].set((reduced - known) / diagonal)
-    return solution
 
 
 def _scale(features: Image, valid: Mask, window: int) -> Image:

@@ -1,0 +1,92 @@
+"""Joint bilateral filter: the mean of near pixels with like features and radiance.
+
+Layout: images [H,W,C], linear radiance. Radiance is compared through a smoothed image
+and in units of its noise, features in units of their standard deviations.
+
+Sources:
+    J. Kopf et al., "Joint bilateral upsampling", 2007; T.-M. Li et al., "SURE-based
+    optimization for adaptive sampling and reconstruction", 2012 (the distance).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.features import stack
+from jscomb.frame import Biased, Frame
+from jscomb.numerics.bilateral import bilateral_mean
+from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.windows import window_mean
+from jscomb.typing import Image, Variance
+
+_POOL = 3  # width that the guide and its variance are averaged over
+
+
+def denoise(
+    image: Image,
+    variance: Variance,
+    features: Float[Array, "h w f"],
+    *,
+    window: int = 21,
+    sigma: float = 5.0,
+    sigma_radiance: float = 2.0,
+    sigma_features: float = 0.15,
+) -> Image:
+    """Replace each pixel by the mean of near ones that are alike.
+
+    Pure, differentiable in every array, and scale-equivariant.
+
+    Args:
+        image: radiance, shape [H,W,C].
+        variance: of the mean, squared radiance, at least zero, shape [H,W,C].
+        features: of a range of about one, shape [H,W,F]; F may be 0.
+        window: width of the windows in pixels, odd.
+        sigma: > 0, standard deviation of the distance, in pixels.
+        sigma_radiance: > 0, of the radiance, in units of its noise.
+        sigma_features: > 0, of the features, in their unit.
+
+    Returns:
+        the mean, shape [H,W,C]; at a pixel that is not finite in some input the image
+        itself if finite, else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+    """
+    check_same_shape(image=image, variance=variance)
+    if features.shape[:2] != image.shape[:2]:
+        raise ValueError(f"features has shape {features.shape}, image {image.shape}")
+    smooth, noise = (
+        window_mean(i, _POOL, mask=finite(image, variance)) for i in (image, variance)
+    )
+    filtered = bilateral_mean(
+        image,
+        features / (2**0.5 * sigma_features),
+        smooth / (2**0.5 * sigma_radiance),
+        noise,
+        window=window,
+        sigma=sigma,
+    )
+    return jnp.where(finite(image, variance, features), filtered, first_finite(image))
+
+
+# Called with values, a loop over tiles would be compiled anew each time.
+_denoise = jax.jit(denoise, static_argnames="window")
+
+
+def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
+    """Denoise a frame with the features it has, and each of its halves by itself.
+
+    Args:
+        frame: with variances, or sub-buffers to estimate them from.
+        window: width of the windows in pixels, odd.
+
+    Returns:
+        the denoised frame; its halves if they have variances.
+
+    Raises:
+        ValueError: if the frame has no way to know the variance.
+    """
+    one = lambda part: _denoise(part.color, part.variance, stack(part), window=window)
+    if frame.sub_buffers < (4 if frame.buffers.variance is None else 2):
+        return Biased(one(frame))
+    return Biased(one(frame), jnp.stack([one(half) for half in frame.halves()]))

@@ -1,0 +1,258 @@
+"""What the halves tell of the bases' errors: matrices, of pixels and of windows."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.windows import window_mean
+from jscomb.typing import Image, Mask
+
+Bases = Float[Array, "n h w c"]
+Matrix = Float[Array, "n n h w _"]
+Packed = Float[Array, "h w _"]  # upper triangles of matrices
+
+_LEAST = 0.01  # of the frame's mean radiance squared; keeps black pixels from deciding
+SCALES = 11, 21, 41, 81
+
+
+def mse_matrix(
+    biased_a: Bases, biased_b: Bases, unbiased_a: Image, unbiased_b: Image
+) -> Matrix:
+    """Estimate the error matrix of every pixel and channel from the halves.
+
+    Args:
+        biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
+        biased_b: y^b, likewise of half b.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, likewise.
+
+    Returns:
+        <M>, squared radiance, shape [N,N,H,W,C].
+
+    Raises:
+        ValueError: while tracing, if shapes differ or there is no base.
+
+    Source: ED eq. 11, 12.
+    """
+    check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
+    product = unbiased_a * unbiased_b
+
+    def one(y: Bases, truth: Image) -> Matrix:
+        pairs = y[:, None] * y[None] - (y[:, None] + y[None]) * truth[None, None]
+        return pairs + product[None, None]
+
+    return (one(biased_a, unbiased_b) + one(biased_b, unbiased_a)) / 2
+
+
+def true_matrix(biased: Float[Array, "s n h w c"], truth: Image) -> Matrix:
+    """The error matrix itself, from many renderings of the same frame.
+
+    Args:
+        biased: each base of S independent renderings, shape [S,N,H,W,C]; for the matrix
+            of halves those of one half.
+        truth: the true image, shape [H,W,C].
+
+    Returns:
+        M, squared radiance, shape [N,N,H,W,C].
+
+    Source: ED eq. 7, 15.
+    """
+    error = biased - truth[None, None]
+    return jnp.mean(error[:, :, None] * error[:, None], axis=0)
+
+
+def error_matrix(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    windows: Sequence[int] = SCALES,
+    whole_frame: bool = True,
+    shared: bool = True,
+) -> Matrix:
+    """Estimate the error matrix over windows, as local as the halves can tell.
+
+    From the largest scale to the smallest each window's mean is taken as far as both
+    halves agree, within the larger window, on how it differs from that:
+
+        share = <d_a . d_b> / <|(d_a + d_b) / 2|^2>,    d = <M>_window - <M>_larger.
+
+    Args:
+        biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
+        biased_b: y^b, likewise of half b.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, likewise.
+        windows: widths in pixels, odd, ascending. One of them without `whole_frame`
+            gives the plain mean over that window.
+        whole_frame: the frame is the largest scale.
+        shared: one matrix for all channels, else one for each.
+
+    Returns:
+        <M> in excess of the plain average's error and relative to the pixel's radiance,
+        without unit, shape [N,N,H,W,1], or [N,N,H,W,C] if not shared. At an invalid
+        pixel that of the pixels around it.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, there is no base, or no scale.
+
+    Source: ours, from ED eq. 11, 12.
+    """
+    check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
+    if not windows and not whole_frame:
+        raise ValueError("error_matrix needs a window, or the whole frame")
+    a, b, valid = evidence_of(biased_a, biased_b, unbiased_a, unbiased_b, shared)
+    means = [
+        tuple(window_mean(half, window, mask=valid) for half in (a, b))
+        for window in windows
+    ]
+    if whole_frame:
+        count = jnp.maximum(jnp.sum(valid), 1).astype(a.dtype)
+        total = lambda half: jnp.sum(half, axis=(0, 1), keepdims=True) / count
+        means.append(
+            tuple(jnp.broadcast_to(total(half), half.shape) for half in (a, b))
+        )
+    larger_a, larger_b = means[-1]
+    kept = (larger_a + larger_b) / 2
+    pools = [*windows[1:], None]
+    for pool, (a, b) in reversed(
+        list(zip(pools, means, strict=False))[: len(means) - 1]
+    ):
+        share = _agreement(a - larger_a, b - larger_b, pool, valid)
+        kept = kept + share * ((a + b) / 2 - kept)
+        larger_a, larger_b = a, b
+    return unpacked(kept, len(biased_a))
+
+
+def _agreement(
+    a: Packed, b: Packed, pool: int | None, valid: Mask
+) -> Float[Array, "h w 1"]:
+    """How much of what both halves say is not noise, in [0, 1], [H,W,1]."""
+    spread = jnp.mean(jnp.square(a) + jnp.square(b), axis=(0, 1), keepdims=True)
+    some = spread > 0  # no bad base's elements shall decide alone
+    scale = jnp.where(some, jax.lax.rsqrt(jnp.where(some, spread, 1.0)), 0.0)
+    a, b = a * scale, b * scale
+    both = jnp.sum(a * b, axis=-1, keepdims=True)
+    square = jnp.sum(jnp.square((a + b) / 2), axis=-1, keepdims=True)
+    if pool is None:
+        both, square = (
+            jnp.broadcast_to(jnp.mean(jnp.where(valid, i, 0.0)), i.shape)
+            for i in (both, square)
+        )
+    else:
+        both, square = (window_mean(i, pool, mask=valid) for i in (both, square))
+    return jnp.clip(divide(both, square, where=square > 0), 0.0, 1.0)
+
+
+class Evidence(NamedTuple):
+    """What each half says of all pairs of bases: upper triangles of <M>, relative.
+
+    In excess of the plain average's error, so that the noise of x, which all elements
+    have in common, drowns nothing.
+
+    Attributes:
+        a: of <M>^a, [H,W,P*C] with P pairs; without unit.
+        b: of <M>^b, likewise.
+        valid: pixels that are finite in all images, [H,W,1].
+    """
+
+    a: Packed
+    b: Packed
+    valid: Mask
+
+
+def evidence_of(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    shared: bool,
+) -> Evidence:
+    """What each half says of all pairs of bases.
+
+    Relative to the pixel's radiance, so that no bright region decides for all.
+
+    Args:
+        biased_a: y^a, shape [N,H,W,C].
+        biased_b: y^b, likewise.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, likewise.
+        shared: the mean of all channels, else each by itself.
+
+    Returns:
+        upper triangles of <M>^a and <M>^b; 0 at invalid pixels.
+    """
+    valid = finite(unbiased_a, unbiased_b, *biased_a, *biased_b)
+    rows, columns = np.triu_indices(len(biased_a))
+
+    def clean(image: Array) -> Array:
+        mask = valid if image.ndim == 3 else valid[None]
+        return jnp.where(mask, image, 0.0)
+
+    y_a, y_b, x_a, x_b = map(clean, (biased_a, biased_b, unbiased_a, unbiased_b))
+    means = jnp.mean(y_a, axis=0), jnp.mean(y_b, axis=0)
+    # The median: one base may carry a light's glow far beyond the light.
+    typical = (jnp.median(y_a, axis=0) + jnp.median(y_b, axis=0)) / 2
+    bright = jnp.mean(typical, axis=-1, keepdims=True)
+    count = jnp.maximum(jnp.sum(valid), 1).astype(bright.dtype)
+    square = jnp.square(bright) + _LEAST * jnp.square(jnp.sum(bright) / count)
+    scale = jnp.broadcast_to(square, x_a.shape)
+
+    def one(y: Bases, mean: Image, truth: Image) -> Packed:
+        e = y - mean[None]
+        both = e[rows] * e[columns] + (e[rows] + e[columns]) * (mean - truth)[None]
+        both = divide(both, jnp.broadcast_to(scale[None], both.shape), where=both != 0)
+        if shared:
+            both = jnp.mean(both, axis=-1, keepdims=True)
+        return jnp.moveaxis(both, 0, 2).reshape(*valid.shape[:2], -1)
+
+    return Evidence(one(y_a, means[0], x_b), one(y_b, means[1], x_a), valid)
+
+
+def unpacked(upper: Packed, n: int) -> Matrix:
+    """Symmetric matrices from their upper triangles.
+
+    Args:
+        upper: shape [H,W,P*C], P = N (N + 1) / 2.
+        n: N.
+
+    Returns:
+        the matrices, shape [N,N,H,W,C].
+    """
+    place = np.zeros((n, n), int)
+    place[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
+    pairs = jnp.moveaxis(upper.reshape(*upper.shape[:2], n * (n + 1) // 2, -1), 2, 0)
+    return pairs[np.maximum(place, place.T)]
+
+
+def check_bases(biased_a: Bases, biased_b: Bases, x_a: Image, x_b: Image) -> None:
+    """Raise unless there is a base and all images have one shape.
+
+    Args:
+        biased_a: to be [N,H,W,C].
+        biased_b: to be of the same shape.
+        x_a: to be [H,W,C].
+        x_b: likewise.
+
+    Returns:
+        nothing.
+
+    Raises:
+        ValueError: while tracing; names the array and both shapes.
+    """
+    check_same_shape(unbiased_a=x_a, unbiased_b=x_b)
+    for name, bases in {"biased_a": biased_a, "biased_b": biased_b}.items():
+        if bases.ndim != 4 or len(bases) == 0:
+            raise ValueError(
+                f"{name} must be [N,H,W,C] with at least one base, got {bases.shape}"
+            )
+        if bases.shape[1:] != x_a.shape or len(bases) != len(biased_a):
+            raise ValueError(
+                f"{name} has shape {bases.shape}, expected "
+                f"{(len(biased_a), *x_a.shape)}: unbiased_a has {x_a.shape}"
+            )

@@ -1,0 +1,103 @@
+"""Which bases a frame needs."""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jscomb.ensemble.errors import Bases, Matrix, check_bases, evidence_of, unpacked
+from jscomb.numerics import simplex
+from jscomb.numerics.windows import window_mean
+from jscomb.typing import Image
+
+
+class Selected(NamedTuple):
+    """Which bases an ensemble needs.
+
+    Attributes:
+        kept: their numbers, ascending.
+        errors: estimated relative error of the ensemble, in excess of the plain
+            average's, with all bases, and after each was dropped.
+    """
+
+    kept: tuple[int, ...]
+    errors: tuple[float, ...]
+
+
+def select_bases(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    window: int = 31,
+) -> Selected:
+    """Drop bases without which the estimated error of the whole frame does not rise.
+
+    Weights from one half's errors are judged by the other's, so a base that only fits
+    noise shows. One base after the other, each time the one with the greatest gain.
+    Decides on values, so it is not for `jit`.
+
+    Args:
+        biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
+        biased_b: y^b, likewise of half b.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, likewise.
+        window: width in pixels that errors are averaged over, odd.
+
+    Returns:
+        what is left, and what that does to the error.
+
+    Raises:
+        ValueError: if shapes differ or there is no base.
+
+    Source: ours.
+    """
+    check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
+    halves = _halves(biased_a, biased_b, unbiased_a, unbiased_b, window=window)
+    kept = list(range(len(biased_a)))
+    errors = [_judged(halves, kept)]
+    while len(kept) > 1:
+        without = {i: _judged(halves, [k for k in kept if k != i]) for i in kept}
+        worst = min(without, key=lambda i: without[i])
+        if without[worst] > errors[-1]:
+            break
+        kept.remove(worst)
+        errors.append(without[worst])
+    return Selected(tuple(kept), tuple(errors))
+
+
+@functools.partial(jax.jit, static_argnames="window")
+def _halves(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    window: int,
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Of both halves the errors over windows, and of single pixels."""
+    images = biased_a, biased_b, unbiased_a, unbiased_b
+    a, b, valid = evidence_of(*images, shared=True)
+    near = (window_mean(half, window, mask=valid) for half in (a, b))
+    n = len(biased_a)
+    near_a, near_b, a, b = (unpacked(i, n) for i in (*near, a, b))
+    return near_a, near_b, a, b
+
+
+def _judged(halves: tuple[Matrix, ...], kept: Sequence[int]) -> float:
+    """Error over the frame of weights found by one half, as the other sees it."""
+    some = np.array(kept)
+    near_a, near_b, a, b = (m[some[:, None], some[None]] for m in halves)
+    return float(_cross_error(near_a, b) + _cross_error(near_b, a)) / 2
+
+
+@jax.jit
+def _cross_error(near: Matrix, errors: Matrix) -> Array:
+    """Mean over the frame of w'Mw with the weights of other matrices."""
+    w = simplex.quadratic(near)
+    return jnp.mean(jnp.sum(w[:, None] * w[None] * errors, axis=(0, 1)))

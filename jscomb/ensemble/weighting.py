@@ -1,0 +1,224 @@
+"""From errors to weights, and from weights to the image."""
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+
+from jscomb.ensemble.errors import SCALES, Bases, check_bases, error_matrix
+from jscomb.numerics import simplex
+from jscomb.numerics.bilateral import bilateral_mean
+from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.typing import Image, Key, Variance
+
+Solver = Literal["hull", "iterative", "reference", "multi-scale"]
+
+
+def combine(
+    biased: Bases,
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    solver: Solver = "hull",
+    filter: bool = True,
+    albedo: Image | None = None,
+    normal: Image | None = None,
+    solver_key: Key | None = None,
+    windows: Sequence[int] = SCALES,
+    shared: bool = True,
+) -> Image:
+    """Combine any number of bases by the weights of least estimated error.
+
+    Pure, scale-equivariant, and differentiable in every array with the exact solvers.
+    The default is the paper's method; `solver="multi-scale", filter=False` measures
+    better on every frame that we have.
+
+    Args:
+        biased: y, each base of the full frame, radiance, shape [N,H,W,C]. The unbiased
+            image may be one of them, which makes the result consistent.
+        biased_a: the bases made from half a, likewise.
+        biased_b: the bases made from half b, likewise.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, likewise.
+        solver: see `solve_weights`.
+        filter: smooth the weights by `filter_weights`.
+        albedo: guide of the filter, shape [H,W,3]; optional, as is the normal.
+        normal: guide of the filter, shape [H,W,3].
+        solver_key: of the iterative solver, a typed key.
+        windows: of "multi-scale".
+        shared: of "multi-scale", one weight for all channels.
+
+    Returns:
+        the combined image, radiance, shape [H,W,C]; at a pixel where a base is not
+        finite the first that is, else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, there is no base, or as
+            `solve_weights`.
+
+    Source: ED section 4.
+    """
+    halves = biased_a, biased_b, unbiased_a, unbiased_b
+    if biased.shape != biased_a.shape:
+        raise ValueError(f"biased is {biased.shape}, biased_a is {biased_a.shape}")
+    weights = solve_weights(
+        *halves, solver=solver, solver_key=solver_key, windows=windows, shared=shared
+    )
+    if filter:
+        z, z_a, z_b = (average(y, weights) for y in (biased, biased_a, biased_b))
+        noise = jnp.square(z_a - z_b) / 2
+        weights = filter_weights(weights, z, noise, albedo=albedo, normal=normal)
+    return average(biased, weights)
+
+
+def solve_weights(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    solver: Solver = "hull",
+    solver_key: Key | None = None,
+    windows: Sequence[int] = SCALES,
+    shared: bool = True,
+) -> Bases:
+    """Weights of the bases at every pixel.
+
+    Args:
+        biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
+        biased_b: y^b, likewise of half b.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, likewise.
+        solver: "hull", the paper's objective of single pixels and channels, exactly;
+            "iterative" and "reference", the same by the paper's solver and by jaxopt;
+            "multi-scale", ours: `quadratic` on `error_matrix`.
+        solver_key: of the iterative solver, a typed key.
+        windows: of "multi-scale".
+        shared: of "multi-scale", one weight for all channels.
+
+    Returns:
+        the weights, at least zero, of sum one, shape [N,H,W,C]; at a pixel that is not
+        finite in some input 1/N, or those of the pixels around it.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, there is no base, the solver is not
+            known, or lacks its key.
+
+    Source: ED eq. 13, 14.
+    """
+    check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
+    images = biased_a, biased_b, unbiased_a, unbiased_b
+    if solver == "multi-scale":
+        matrix = error_matrix(*images, windows=windows, shared=shared)
+        weights = simplex.quadratic(matrix)
+        return jnp.broadcast_to(weights, biased_a.shape)
+    valid = finite(unbiased_a, unbiased_b, *biased_a, *biased_b)
+    clean = [jnp.where(valid if i.ndim == 3 else valid[None], i, 0.0) for i in images]
+    if solver == "hull":
+        return simplex.hull(*clean)
+    if solver == "reference":
+        return simplex.reference(*clean)
+    if solver != "iterative":
+        raise ValueError(f"solver must be one of {get_args(Solver)}, got {solver!r}")
+    if solver_key is None:
+        raise ValueError("the iterative solver needs solver_key")
+    return simplex.iterative(solver_key, *clean)
+
+
+def one_hot(errors: Bases) -> Bases:
+    """Weights that take the base of least error alone.
+
+    Args:
+        errors: of each base at each pixel, for example the diagonal of `mse_matrix`,
+            as it is or filtered, shape [N,H,W,C].
+
+    Returns:
+        1 for the base of least error, the first of equals, else 0, shape [N,H,W,C].
+
+    Source: ED eq. 36, 37.
+    """
+    best = jnp.argmin(errors, axis=0)
+    return jax.nn.one_hot(best, len(errors), axis=0, dtype=errors.dtype)
+
+
+def filter_weights(
+    weights: Bases,
+    combined: Image,
+    variance: Variance,
+    *,
+    albedo: Image | None = None,
+    normal: Image | None = None,
+    radius: int = 7,
+    sigma: float = 3.0,
+    sigma_radiance: float = 2.0,
+    sigma_albedo: float = 0.25,
+    sigma_normal: float = 0.15,
+) -> Bases:
+    """Smooth weights where image and features are smooth.
+
+    Args:
+        weights: of the bases, shape [N,H,W,C].
+        combined: z, the ensemble with these weights, radiance, shape [H,W,C].
+        variance: of z, squared radiance, shape [H,W,C].
+        albedo: shape [H,W,3]; optional, as is the normal.
+        normal: shape [H,W,3].
+        radius: of the windows, in pixels.
+        sigma: standard deviation of the distance, in pixels.
+        sigma_radiance: of z, in units of its noise.
+        sigma_albedo: of the albedo.
+        sigma_normal: of the normal.
+
+    Returns:
+        the filtered weights, shape [N,H,W,C]; those of pixels that are not finite in
+        some input are the weights as they were.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Source: ED eq. 32-34, with the constants of section 4.2.
+    """
+    n, h, w, c = weights.shape
+    check_same_shape(combined=combined, variance=variance)
+    scaled = [
+        image / (2**0.5 * s)
+        for image, s in ((albedo, sigma_albedo), (normal, sigma_normal))
+        if image is not None
+    ]
+    for name, image in (("weights", weights[0]), *(("a guide", i) for i in scaled)):
+        if image.shape[:2] != combined.shape[:2]:
+            raise ValueError(f"{name} has {image.shape}, combined {combined.shape}")
+    none = jnp.zeros((h, w, 0), combined.dtype)
+    guide = jnp.concatenate([none, *scaled], axis=-1)
+    flat = jnp.moveaxis(weights, 0, 2).reshape(h, w, n * c)
+    filtered = bilateral_mean(
+        flat,
+        guide,
+        combined / (2**0.5 * sigma_radiance),
+        variance,
+        window=2 * radius + 1,
+        sigma=sigma,
+    )
+    known = finite(flat, guide, combined, variance)
+    filtered = jnp.where(known, filtered, flat)
+    return jnp.moveaxis(filtered.reshape(h, w, n, c), 2, 0)
+
+
+def average(biased: Bases, weights: Bases) -> Image:
+    """The ensemble: the bases' mean with weights.
+
+    Args:
+        biased: y, radiance, shape [N,H,W,C].
+        weights: of sum one, shape [N,H,W,C].
+
+    Returns:
+        the image, shape [H,W,C]; at a pixel where a base is not finite the first that
+        is, else 0.
+
+    Source: ED eq. 3.
+    """
+    valid = finite(*biased)
+    total = jnp.sum(weights * jnp.where(valid[None], biased, 0.0), axis=0)
+    return jnp.where(valid, total, first_finite(*biased))

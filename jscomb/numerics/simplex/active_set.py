@@ -1,0 +1,112 @@
+"""What both exact solvers share: which of N weights are not zero, and equal bases."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jscomb.numerics.guards import divide
+
+Flat = Float[Array, "n m"]  # weights of M problems
+Free = Bool[Array, "n m"]
+
+_STEPS = 16  # for each base; never needed but when rounding decides
+_CHUNK = 4096
+
+
+def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
+    """Weights of many problems, some thousands at a time.
+
+    Those fit into the cache, and only they wait for the slowest among them.
+
+    Args:
+        function: of arrays with the problems on their last axis, to weights [N,M].
+        arrays: with M problems on their last axis.
+
+    Returns:
+        the weights, shape [N,M].
+    """
+    count = arrays[0].shape[-1]
+    pieces = -(-count // _CHUNK)
+    if pieces <= 1:
+        return function(*arrays)
+
+    def pieces_of(array: Array) -> Array:
+        ends = [(0, 0)] * (array.ndim - 1) + [(0, pieces * _CHUNK - count)]
+        padded = jnp.pad(array, ends)
+        return jnp.moveaxis(padded.reshape(*array.shape[:-1], pieces, _CHUNK), -2, 0)
+
+    each = lax.map(lambda piece: function(*piece), tuple(map(pieces_of, arrays)))
+    return jnp.moveaxis(each, 0, 1).reshape(each.shape[1], -1)[:, :count]
+
+
+def search(
+    minimise: Callable[[Free], tuple[Flat, Flat]],
+    start: Flat,
+    free: Free,
+    active: Bool[Array, " m"],
+) -> tuple[Flat, Free]:
+    """Minimise convex quadratic functions of nonnegative weights.
+
+    From feasible weights towards the minimum of the free ones, until one of them
+    becomes zero and is fixed; at the minimum the fixed weight with the steepest descent
+    is freed. The function never rises, so no set is visited twice and the search ends;
+    at the latest where rounding fixes a weight that has just been freed.
+
+    Args:
+        minimise: of the free weights, to the minimum over them, 0 elsewhere, and the
+            derivative with respect to each weight there; a fixed one is freed if it is
+            negative.
+        start: feasible weights, shape [N,M].
+        free: the weights that are not fixed at zero there, shape [N,M].
+        active: problems to solve; the others keep their start.
+
+    Returns:
+        the weights, and which of them are free.
+    """
+    n = len(start)
+    number = jnp.arange(n)[:, None]
+
+    def unfinished(state: tuple) -> Array:
+        step, *_, active = state
+        return (step < _STEPS * n) & jnp.any(active)
+
+    def advance(state: tuple) -> tuple:
+        step, w, free, fresh, active = state
+        minimum, slope = minimise(free)
+        blocking = free & (minimum < 0)
+        reach = divide(w, w - minimum, where=blocking, otherwise=jnp.inf)
+        share = jnp.minimum(jnp.min(reach, axis=0, keepdims=True), 1.0)
+        fixed = blocking & (reach <= share)
+        moved = jnp.where(fixed, 0.0, jnp.maximum(w + share * (minimum - w), 0.0))
+        slope = jnp.where(free, jnp.inf, slope)
+        arrived, steepest = share >= 1, jnp.argmin(slope, axis=0, keepdims=True)
+        freed = arrived & (slope < 0) & (number == steepest)
+        moves = active[None]
+        done = (arrived[0] & ~jnp.any(freed, axis=0)) | jnp.any(fresh & fixed, axis=0)
+        return (
+            step + 1,
+            jnp.where(moves, moved, w),
+            jnp.where(moves, (free & ~fixed) | freed, free),
+            freed,
+            active & ~done,
+        )
+
+    state = (0, start, free, jnp.zeros_like(free), active)
+    _, w, free, _, _ = lax.while_loop(unfinished, advance, state)
+    return w, free
+
+
+def shared_by_equals(w: Flat, equal: Bool[Array, "n n m"]) -> Flat:
+    """The same weight for bases that cannot be told apart.
+
+    Args:
+        w: weights, shape [N,M].
+        equal: which bases are equal, itself among them, shape [N,N,M].
+
+    Returns:
+        the weights, shape [N,M].
+    """
+    count = jnp.sum(equal, axis=1).astype(w.dtype)
+    return jnp.sum(jnp.where(equal, w[None], 0.0), axis=1) / count

@@ -1,0 +1,126 @@
+"""The paper's solver: one base after the other is blended in, in closed form."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jscomb.numerics.simplex.active_set import Flat
+from jscomb.numerics.simplex.hull import Points, Targets, Weights, plane, share_of
+from jscomb.numerics.simplex.quadratic import Matrix, objective_of, share_along
+from jscomb.typing import Key
+
+
+def iterative(
+    key: Key,
+    points_a: Points,
+    points_b: Points,
+    target_a: Targets,
+    target_b: Targets,
+    *,
+    steps: int = 1024,
+    tolerance: float = 1e-6,
+    patience: int = 3,
+) -> Weights:
+    """Weights of the least squares of `hull`, by blending in one base at a time.
+
+    From random weights; in each cycle every base once, in a random order that all
+    problems share. Many thousands of steps from exact where the optimum mixes three or
+    more bases; not differentiable.
+
+    Args:
+        key: of the start and of the orders, a typed key.
+        points_a: of each base, from half a, any unit, shape [N,...].
+        points_b: from half b, likewise.
+        target_a: from half a, same unit, shape [...].
+        target_b: from half b, likewise.
+        steps: blends at most.
+        tolerance: a cycle in which no weight of any problem moves more is quiet.
+        patience: quiet cycles in a row after which to stop.
+
+    Returns:
+        the weights, shape [N,...].
+
+    Raises:
+        ValueError: while tracing, if there is no base or shapes differ.
+
+    Source: ED section 4.1.2; relative where the authors' program compares with 1e-6.
+    """
+    u, c = plane(points_a, points_b, target_a, target_b)
+
+    def share(w: Flat, base: Array) -> Float[Array, " m"]:
+        now = jnp.sum(w[:, None] * u, axis=0)
+        return share_of(now, u[base], c)
+
+    w = _cycles(key, share, (len(u), u.shape[2]), u.dtype, steps, tolerance, patience)
+    return w.reshape(points_a.shape)
+
+
+def iterative_quadratic(
+    key: Key,
+    matrix: Matrix,
+    *,
+    steps: int = 1024,
+    tolerance: float = 1e-6,
+    patience: int = 3,
+) -> Weights:
+    """Weights of least w'Mw, of `quadratic`, by blending in one base at a time.
+
+    Args:
+        key: of the start and of the orders, a typed key.
+        matrix: M, any unit, shape [N,N,...].
+        steps: blends at most.
+        tolerance: a cycle in which no weight of any problem moves more is quiet.
+        patience: quiet cycles in a row after which to stop.
+
+    Returns:
+        the weights, shape [N,...].
+
+    Raises:
+        ValueError: while tracing, if the matrix is not square or N is 0.
+
+    Source: ED section 4.1.2, for any matrix.
+    """
+    objective = objective_of(matrix)
+    share = lambda w, base: share_along(objective, w, base)
+    shape, dtype = objective.linear.shape, matrix.dtype
+    w = _cycles(key, share, shape, dtype, steps, tolerance, patience)
+    return w.reshape(matrix.shape[1:])
+
+
+def _cycles(
+    key: Key,
+    share: Callable[[Flat, Array], Float[Array, " m"]],
+    shape: tuple[int, ...],
+    dtype: jnp.dtype,
+    steps: int,
+    tolerance: float,
+    patience: int,
+) -> Flat:
+    """Blend until nothing moves; `share` is that of one base in the best blend."""
+    n, _ = shape
+    of_start, of_orders = jax.random.split(key)
+    w = jax.random.uniform(of_start, shape, dtype)
+    w = w / jnp.sum(w, axis=0, keepdims=True)
+
+    def unfinished(state: tuple) -> Array:
+        cycle, quiet, _ = state
+        return (cycle * n < steps) & (quiet < patience)
+
+    def advance(state: tuple) -> tuple:
+        cycle, quiet, w = state
+        order = jax.random.permutation(jax.random.fold_in(of_orders, cycle), n)
+
+        def blend(w: Flat, base: Array) -> tuple[Flat, None]:
+            s = share(w, base)[None]
+            chosen = (jnp.arange(n) == base).astype(dtype)[:, None]
+            return (1 - s) * w + s * chosen, None
+
+        after, _ = lax.scan(blend, w, order)
+        still = jnp.max(jnp.abs(after - w)) <= tolerance
+        return cycle + 1, jnp.where(still, quiet + 1, 0), after
+
+    _, _, w = lax.while_loop(unfinished, advance, (0, 0, w))
+    return w

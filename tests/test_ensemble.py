@@ -1,0 +1,259 @@
+"""Ensemble denoising: its matrix, weights, filter and promises."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb import ensemble
+from jscomb.denoisers import smoothing
+from jscomb.numerics import simplex
+from jscomb.numerics.bilateral import bilateral_mean
+from tests.statistics import assert_mean, assert_mean_below
+
+RNG = np.random.default_rng(4)
+OURS = {"solver": "multi-scale", "filter": False}
+combine = jax.jit(ensemble.combine, static_argnames=("solver", "filter", "windows"))
+
+
+def bases_of(image):
+    """Three different biased images."""
+    return jnp.stack(
+        [
+            smoothing.gaussian(image, sigma=1.0),
+            smoothing.box(image, window=7),
+            0.9 * smoothing.box(image, window=3),
+        ]
+    )
+
+
+def rendering(key, truth, noise):
+    """Halves, and bases of the full image and of both halves."""
+    a, b = truth[None] + noise * jax.random.normal(key, (2, *truth.shape), truth.dtype)
+    return bases_of((a + b) / 2), bases_of(a), bases_of(b), a, b
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """A smooth ramp with a step."""
+    y, x = np.mgrid[:24, :26] / 24
+    image = np.stack([1 + x, 1 + y, 1 + (x > 0.5)], axis=-1)
+    return jnp.asarray(image)
+
+
+@pytest.fixture(scope="module")
+def many(truth):
+    """Bases of many renderings: of the full images, of half a, and each <M>."""
+
+    def one(key):
+        full, *halves = rendering(key, truth, 0.5)
+        return full, halves[0], ensemble.mse_matrix(*halves)
+
+    return jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), 400))
+
+
+def test_the_matrix_is_unbiased_for_that_of_halves(many, truth):
+    _, half, estimates = map(np.asarray, many)
+    truth = np.asarray(truth)
+    for place in ((3, 4, 0), (12, 13, 2)):
+        for i, j in ((0, 0), (0, 1), (2, 2)):
+            error = half[(slice(None), slice(None), *place)] - truth[place]
+            difference = (
+                estimates[(slice(None), i, j, *place)] - error[:, i] * error[:, j]
+            )
+            assert_mean(difference, 0.0)
+    exact = ensemble.true_matrix(jnp.asarray(half), jnp.asarray(truth))
+    by_loop = np.mean((half[:, 0] - truth) * (half[:, 1] - truth), axis=0)
+    np.testing.assert_allclose(exact[0, 1], by_loop, rtol=1e-10)
+
+
+def test_with_the_true_matrix_no_base_is_better(many, truth):
+    full, _, _ = many
+    matrix = ensemble.true_matrix(full, truth)
+    weights = simplex.quadratic(matrix)
+    error = jnp.sum(weights[:, None] * weights[None] * matrix, axis=(0, 1))
+    single = jnp.stack([matrix[i, i] for i in range(3)])
+    assert (error <= single.min(axis=0) * (1 + 1e-9)).all()
+    combined = jax.vmap(ensemble.average, in_axes=(0, None))(full, weights)
+    measured = jnp.mean((combined - truth[None]) ** 2)
+    np.testing.assert_allclose(measured, error.mean(), rtol=1e-9)
+    assert measured < 0.9 * single.mean(axis=(1, 2, 3)).min()
+
+
+def test_multi_scale_beats_every_base(truth):
+    """On average over renderings, by standard errors; single pixels' weights do not."""
+
+    def one(key):
+        images = rendering(key, truth, 0.5)
+        error = lambda image: jnp.mean((image - truth) ** 2)
+        best = jnp.min(jnp.mean((images[0] - truth[None]) ** 2, axis=(1, 2, 3)))
+        ours = error(ensemble.combine(*images, **OURS, windows=(7, 15)))
+        return ours - best, error(ensemble.combine(*images, filter=False)) - ours
+
+    gain, paper = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), 40))
+    assert_mean_below(gain, 0.0)
+    assert_mean_below(-paper, 0.0)
+
+
+@pytest.mark.parametrize("solver", ["hull", "multi-scale"])
+def test_consistent_if_one_base_is(truth, solver):
+    """With the unbiased image among the bases the error vanishes with the noise."""
+    errors = []
+    for noise in (0.1, 0.01, 0.001):
+        full, y_a, y_b, a, b = rendering(jax.random.key(2), truth, noise)
+        more = lambda bases, x: jnp.concatenate([bases, x[None]])
+        combined = combine(
+            more(full, (a + b) / 2), more(y_a, a), more(y_b, b), a, b, solver=solver
+        )
+        errors.append(float(jnp.mean((combined - truth) ** 2)))
+    assert errors[2] < 0.1 * errors[1] < 0.1 * errors[0]
+
+
+def test_multi_scale_is_between_its_scales(truth):
+    """Pure noise leaves the frame's matrix; what both halves agree on is kept."""
+    images = rendering(jax.random.key(3), truth, 0.5)[1:]
+    frame = ensemble.error_matrix(*images, windows=())
+    assert frame.shape == (3, 3, 24, 26, 1)
+    assert float(jnp.ptp(frame, axis=(2, 3)).max()) < 1e-12
+    same = rendering(jax.random.key(3), truth, 0.0)[1:]
+    multi = ensemble.error_matrix(*same, windows=(7, 15))
+    local = ensemble.error_matrix(*same, windows=(7,), whole_frame=False)
+    np.testing.assert_allclose(multi, local, atol=1e-12)
+    noise = [jnp.asarray(RNG.normal(size=(3, 64, 64, 1))) for _ in range(2)]
+    flat = jnp.ones((64, 64, 1)) + 0.1 * noise[0][0], jnp.ones((64, 64, 1))
+    bases = [1 + 0.1 * i for i in noise]
+    spread = lambda matrix: float(jnp.std(matrix[0, 0]))
+    shrunk = ensemble.error_matrix(*bases, *flat, windows=(7, 15))
+    plain = ensemble.error_matrix(*bases, *flat, windows=(7,), whole_frame=False)
+    assert spread(shrunk) < 0.5 * spread(plain)
+
+
+def test_shared_or_each_channel():
+    images = rendering(jax.random.key(4), jnp.ones((9, 10, 3)), 0.1)[1:]
+    matrix = jax.jit(ensemble.error_matrix, static_argnames=("windows", "shared"))
+    each = matrix(*images, windows=(7,), shared=False)
+    assert each.shape == (3, 3, 9, 10, 3)
+    assert matrix(*images, windows=(7,)).shape == (3, 3, 9, 10, 1)
+    one_channel = [i[..., :1] for i in images]
+    np.testing.assert_allclose(
+        matrix(*one_channel, windows=(7,), shared=False),
+        matrix(*one_channel, windows=(7,)),
+        rtol=1e-10,
+    )
+
+
+def bilateral_by_loops(image, guide, noisy, variance, *, window, sigma):
+    """Every pair of pixels, in float64."""
+    every = np.concatenate([image, guide, noisy, variance], -1)
+    valid = np.isfinite(every).all(-1)
+    out, r = np.zeros_like(image), window // 2
+    for p in np.argwhere(valid):
+        total, weight = 0, 0
+        for q in np.argwhere(valid):
+            if abs(p - q).max() > r:
+                continue
+            a, b = tuple(p), tuple(q)
+            d = ((p - q) ** 2).sum() / (2 * sigma**2) + (
+                (guide[a] - guide[b]) ** 2
+            ).sum()
+            noise = variance[a] + variance[b]
+            square = (noisy[a] - noisy[b]) ** 2
+            far = np.where(square > 0, 1e4, 0)
+            d += np.where(
+                square < 1e4 * noise, square / np.maximum(noise, 1e-300), far
+            ).sum()
+            total, weight = total + np.exp(-d) * image[b], weight + np.exp(-d)
+        out[tuple(p)] = total / weight
+    return out
+
+
+@pytest.mark.parametrize("size", [(9, 12), (1, 1), (1, 7)])
+def test_the_filter_is_the_loops(size):
+    image, noisy = RNG.normal(size=(2, *size, 2))
+    guide, variance = RNG.normal(size=(*size, 3)), RNG.uniform(0, 1, (*size, 2))
+    variance[0, 0] = 0
+    if size == (9, 12):
+        noisy[4, 5, 0], guide[2, 2, 1] = np.nan, np.inf
+    data = image, guide, noisy, variance
+    options = {"window": 5, "sigma": 2.0}
+    filtered = jax.jit(lambda *i: bilateral_mean(*i, **options))
+    arrays = [jnp.asarray(i) for i in data]
+    np.testing.assert_allclose(
+        filtered(*arrays), bilateral_by_loops(*data, **options), rtol=1e-9, atol=1e-12
+    )
+    total = lambda *i: filtered(*i).sum()
+    for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*arrays):
+        assert np.isfinite(gradient).all()
+
+
+def test_filtered_weights_stay_weights(glass_frame):
+    color, albedo, normal = glass_frame.color, glass_frame.albedo, glass_frame.normal
+    w = RNG.dirichlet(np.ones(3), color.shape)
+    w = jnp.asarray(np.moveaxis(w, -1, 0), jnp.float32)
+    smooth = jax.jit(ensemble.filter_weights)
+    out = smooth(w, color, glass_frame.variance, albedo=albedo, normal=normal)
+    np.testing.assert_allclose(out.sum(axis=0), 1, rtol=1e-5)
+    assert out.min() >= 0
+    assert out.std() < 0.8 * w.std()
+    bare = smooth(w, color, glass_frame.variance)
+    assert bare.std() < out.std()  # features keep edges
+    broken = color.at[5, 6, 0].set(jnp.nan)
+    kept = smooth(w, broken, glass_frame.variance)
+    np.testing.assert_array_equal(kept[:, 5, 6], w[:, 5, 6])
+
+
+def test_one_base_is_itself(truth):
+    images = [i[:1] for i in rendering(jax.random.key(5), truth, 0.1)[:3]]
+    x = rendering(jax.random.key(5), truth, 0.1)[3:]
+    for options in ({}, OURS):
+        np.testing.assert_allclose(
+            combine(*images, *x, **options), images[0][0], rtol=1e-12
+        )
+    assert ensemble.select_bases(*images[1:], *x).kept == (0,)
+
+
+def test_selection_drops_what_does_not_help(truth):
+    """A copy and a base of nothing but noise leave, the good one stays."""
+    _, y_a, y_b, a, b = rendering(jax.random.key(6), truth, 0.3)
+    noise = 3 * jnp.asarray(RNG.normal(size=(2, 1, *truth.shape)))
+    more_a = jnp.concatenate([y_a, y_a[:1], noise[0]])
+    more_b = jnp.concatenate([y_b, y_b[:1], noise[1]])
+    chosen = ensemble.select_bases(more_a, more_b, a, b, window=15)
+    assert 4 not in chosen.kept
+    assert not {0, 3} <= set(chosen.kept)
+    assert chosen.errors[-1] <= chosen.errors[0]
+    assert len(chosen.errors) == 6 - len(chosen.kept)
+
+
+def test_one_hot():
+    errors = jnp.asarray([3.0, 1.0, 1.0]).reshape(3, 1, 1, 1)
+    np.testing.assert_array_equal(ensemble.one_hot(errors).ravel(), [0, 1, 0])
+
+
+def test_gradients(truth):
+    images = [i[..., :5, :6, :1] for i in rendering(jax.random.key(7), truth, 0.5)]
+    run = jax.jit(lambda *i: ensemble.combine(*i, **OURS, windows=(3,)))
+    check_grads(run, images, order=1, eps=1e-6, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bad_input(truth):
+    images = rendering(jax.random.key(8), truth, 0.1)
+    run = ensemble.combine
+    with pytest.raises(ValueError, match=r"biased_a must be .* at least one base"):
+        run(*(i[:0] for i in images[:3]), *images[3:])
+    with pytest.raises(
+        ValueError, match=r"biased_b has shape \(2, 24, 26, 3\), expected"
+    ):
+        run(*images[:2], images[2][:2], *images[3:])
+    with pytest.raises(ValueError, match="unbiased_b has shape"):
+        run(*images[:4], images[4][:5])
+    with pytest.raises(ValueError, match=r"biased is \(3, 20, 26, 3\)"):
+        run(images[0][:, :20], *images[1:])
+    with pytest.raises(ValueError, match=r"solver must be one of .*'hull'"):
+        run(*images, solver="best")
+    with pytest.raises(ValueError, match="needs solver_key"):
+        run(*images, solver="iterative")
+    with pytest.raises(ValueError, match="needs a window, or the whole frame"):
+        ensemble.error_matrix(*images[1:], windows=(), whole_frame=False)
