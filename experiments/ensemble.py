@@ -184,14 +184,11 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: if the folder holds no archive.
     """
-    paths = sorted(config.folder.glob("*.npz"))
-    if not paths:
-        raise ValueError(f"{config.folder}: no .npz archive there")
-    cases = [(p, s) for p in paths for s in frames.sample_counts(p)]
+    cases = frames.cases(config.folder, quick=config.quick)
     found: dict[str, dict[str, float]] = {}
     if config.results is not None and config.results.exists():
         found = json.loads(config.results.read_text())
-    for path, samples in tqdm(cases[:1] if config.quick else cases, unit="frame"):
+    for path, samples in tqdm(cases, unit="frame"):
         name = f"{path.stem} {samples}"
         if name in found:
             continue

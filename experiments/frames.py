@@ -63,3 +63,25 @@ def sample_counts(path: pathlib.Path) -> list[int]:
     with np.load(path) as data:
         names = [n for n in data.files if n.startswith("a_color_")]
     return sorted(2 * int(name.rpartition("_")[2]) for name in names)
+
+
+def cases(
+    folder: pathlib.Path, *, quick: bool = False
+) -> list[tuple[pathlib.Path, int]]:
+    """All frames of a folder.
+
+    Args:
+        folder: of archives.
+        quick: only the first, at its least sample count.
+
+    Returns:
+        archives and sample counts, to `load`.
+
+    Raises:
+        ValueError: if the folder holds no archive.
+    """
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        raise ValueError(f"{folder}: no .npz archive there")
+    every = [(path, samples) for path in paths for samples in sample_counts(path)]
+    return every[:1] if quick else every

@@ -30,7 +30,7 @@ class Config:
 
     Attributes:
         folder: of NumPy archives.
-        quick: only the first archive, at its least and greatest sample count.
+        quick: only the first archive, at its least sample count.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
@@ -72,21 +72,16 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
     Raises:
         ValueError: if the folder holds no archive.
     """
-    paths = sorted(config.folder.glob("*.npz"))
-    if not paths:
-        raise ValueError(f"{config.folder}: no .npz archive there")
     found = {}
-    for path in paths[:1] if config.quick else paths:
-        counts = frames.sample_counts(path)
-        for samples in [counts[0], counts[-1]] if config.quick else counts:
-            frame = frames.load(path, samples)
-            assert frame.reference is not None
-            r, noise = frame.reference
-            images = jax.jit(images_of)(frame)  # comes back sorted by name
-            found[path.stem, samples] = {
-                name: float(rel_l2(images[name], r, half_difference=noise))
-                for name in (*INPUTS, *METHODS, "auto", "dual")
-            }
+    for path, samples in frames.cases(config.folder, quick=config.quick):
+        frame = frames.load(path, samples)
+        assert frame.reference is not None
+        r, noise = frame.reference
+        images = jax.jit(images_of)(frame)  # comes back sorted by name
+        found[path.stem, samples] = {
+            name: float(rel_l2(images[name], r, half_difference=noise))
+            for name in (*INPUTS, *METHODS, "auto", "dual")
+        }
     return found
 
 

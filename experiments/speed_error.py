@@ -267,15 +267,12 @@ def run(config: Config) -> tuple[dict[str, float], Results]:
     Raises:
         ValueError: if the folder holds no archive.
     """
-    paths = sorted(config.folder.glob("*.npz"))
-    if not paths:
-        raise ValueError(f"{config.folder}: no .npz archive there")
+    cases = frames.cases(config.folder, quick=config.quick)
     size, repeats = (64, 1) if config.quick else (config.size, config.repeats)
     seconds = medians(parts(size), repeats)
     settings = SETTINGS[:2] if config.quick else SETTINGS
     found: Results = {setting: ([], []) for setting in settings}
-    cases = [(p, s) for p in paths for s in frames.sample_counts(p)]
-    for path, samples in tqdm(cases[:1] if config.quick else cases, unit="frame"):
+    for path, samples in tqdm(cases, unit="frame"):
         frame = frames.load(path, samples)
         frame = frame.scaled(1 / frame.exposure)
         assert frame.reference is not None

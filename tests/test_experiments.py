@@ -5,6 +5,7 @@ import pytest
 
 from experiments import (
     bundle,
+    ensemble,
     frames,
     james_stein_error,
     james_stein_speed,
@@ -106,3 +107,9 @@ def test_a_crop_is_of_every_image(glass_frame):
     cut = bundle.crop(glass_frame, 10, 20)
     np.testing.assert_array_equal(cut.depth, glass_frame.depth[10:, 20:])
     assert cut.samples == glass_frame.samples
+
+
+def test_scores_are_ranks():
+    """The best of three candidates scores 3, the worst 1; means over the frames."""
+    rows = [{"a": 0.1, "b": 0.2, "c": 0.3}, {"a": 9.0, "b": 1.0, "c": 5.0}]
+    assert ensemble.scores(rows, ["a", "b", "c"]) == {"b": 2.5, "a": 2.0, "c": 1.5}

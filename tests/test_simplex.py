@@ -134,9 +134,12 @@ def test_inside_the_hull_the_weights_are_nearest_to_uniform(n):
 def test_the_middle_of_a_square_is_a_quarter_of_each():
     """Though two opposite corners would do."""
     a, b = np.array([[0.0, 2, 0, 2], [0, 0, 2, 2]]).reshape(2, 4, 1)
-    for shift in (0.0, 1e-3, 1e5):
+    for shift in (0.0, 0.5, 1024.0):
         target = np.array([1.0 + shift])
-        np.testing.assert_allclose(hull(a + shift, b + shift, target, target), 0.25)
+        data = a + shift, b + shift, target, target
+        np.testing.assert_allclose(hull(*data), 0.25)
+        single = [jnp.asarray(i, jnp.float32) for i in data]
+        np.testing.assert_allclose(hull(*single), 0.25, rtol=1e-5)
 
 
 @pytest.mark.parametrize("n", [3, 4])

@@ -41,6 +41,19 @@ def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
     return jnp.moveaxis(each, 0, 1).reshape(each.shape[1], -1)[:, :count]
 
 
+def least_weight(w: Flat) -> float:
+    """What a weight of zero may be by rounding.
+
+    Args:
+        w: weights, for their precision.
+
+    Returns:
+        a number just below zero. A weight there stays free: on the line between two
+        others a third one has none, but may make room for a fourth.
+    """
+    return -32 * float(jnp.finfo(w.dtype).eps)
+
+
 def search(
     minimise: Callable[[Free], tuple[Flat, Flat]],
     start: Flat,
@@ -65,7 +78,7 @@ def search(
     Returns:
         the weights, and which of them are free.
     """
-    n = len(start)
+    n, least = len(start), least_weight(start)
     number = jnp.arange(n)[:, None]
 
     def unfinished(state: tuple) -> Array:
@@ -75,7 +88,7 @@ def search(
     def advance(state: tuple) -> tuple:
         step, w, free, fresh, active = state
         minimum, slope = minimise(free)
-        blocking = free & (minimum < 0)
+        blocking = free & (minimum < least)
         reach = divide(w, w - minimum, where=blocking, otherwise=jnp.inf)
         share = jnp.minimum(jnp.min(reach, axis=0, keepdims=True), 1.0)
         fixed = blocking & (reach <= share)

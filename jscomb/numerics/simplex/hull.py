@@ -72,7 +72,7 @@ def hull(
     Example:
         >>> import jax.numpy as jnp
         >>> a, b = jnp.array([0.0, 2.0, 0.0, 2.0]), jnp.array([0.0, 0.0, 2.0, 2.0])
-        >>> print(hull(a, b, jnp.array(1.0), jnp.array(1.0)))
+        >>> print(hull(a, b, jnp.array(1.0), jnp.array(1.0)).round(3))
         [0.25 0.25 0.25 0.25]
 
     Source: ours, for the objective of ED eq. 14.
