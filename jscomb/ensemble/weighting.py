@@ -34,7 +34,7 @@ def combine(
 
     Pure, scale-equivariant, and differentiable in every array with the exact solvers.
     The default is the paper's method; `solver="multi-scale", filter=False` measures
-    better on every frame that we have.
+    better, and most often better than the best base.
 
     Args:
         biased: y, each base of the full frame, radiance, shape [N,H,W,C]. The unbiased
