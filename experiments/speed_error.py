@@ -319,7 +319,11 @@ def draw(found: Results, path: pathlib.Path) -> None:
     for name, (error, _, time_of_one) in ratios(found).items():
         axes.plot(time_of_one, error, next(markers), label=name)
     figure.legend(loc="outside right upper")
-    axes.set(xscale="log", xlabel="time of y* / that of stride 1, 51x51")
+    axes.set_xscale("log")
+    ticks = [0.1, 0.2, 0.5, 1, 2]
+    axes.set_xticks(ticks, labels=map(str, ticks))
+    axes.minorticks_off()
+    axes.set(xlabel="time of y* / that of stride 1, 51x51")
     axes.set(ylabel="relative L2 of y* / that of stride 1, 51x51")
     figure.savefig(path, dpi=120)
 
