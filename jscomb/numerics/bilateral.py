@@ -17,6 +17,8 @@ Sources:
     ED eq. 32-34.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -25,6 +27,8 @@ from jaxtyping import Array, Float
 from jscomb.numerics.guards import divide, finite
 from jscomb.numerics.tiles import Grid, Planes, Region, sum_over_tiles
 from jscomb.numerics.windows import check_window
+
+Plane = Float[Array, "_ _"]
 
 # A distance beyond which a weight is 0 in any precision.
 _FARTHEST = 1e4
@@ -62,44 +66,52 @@ def bilateral_mean(
     reach = check_window(window) // 2
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
-    k, g, z = image.shape[-1], guide.shape[-1], noisy.shape[-1]
     grid = Grid(_TILE, 1, reach, _TILES)
     valid = finite(image, guide, noisy, variance)
     ones = jnp.ones_like(valid, image.dtype)
-    stacked = jnp.concatenate([image, ones, guide, noisy, variance], axis=-1)
-    planes = jnp.moveaxis(jnp.where(valid, stacked, 0.0), -1, 0)
-    ends = k + 1, k + 1 + g, k + 1 + g + z
+    # Where not valid the ones are 0 as well, so those pixels are not counted.
+    regions = [
+        Region(jnp.moveaxis(jnp.where(valid, planes, 0.0), -1, 0), reach)
+        for planes in (jnp.concatenate([image, ones], -1), guide, noisy, variance)
+    ]
 
-    def distance(p: Planes, q: Planes) -> Float[Array, "t t"]:
-        """Of the guides; far from pixels that are not valid."""
-        _, g_p, z_p, v_p = jnp.split(p, ends)
-        taken, g_q, z_q, v_q = jnp.split(q, ends)
-        square, noise = jnp.square(z_p - z_q), v_p + v_q
-        known = _FARTHEST * noise > square
-        far = jnp.where(square > 0, _FARTHEST, jnp.zeros_like(square))
-        ratio = divide(square, noise, where=known, otherwise=far)
-        total = jnp.sum(jnp.square(g_p - g_q), axis=0) + jnp.sum(ratio, axis=0)
-        return jnp.where(taken[-1] > 0, total, _FARTHEST)
-
-    def mean(near: Planes) -> Planes:
+    def mean(*near: Planes) -> Planes:
         """Sums over the windows of a tile: of the images and of the weights."""
-        centre = near[:, reach : reach + _TILE, reach : reach + _TILE]
+        middle = slice(reach, reach + _TILE)
+        centre = [planes[:, middle, middle] for planes in near]
 
+        # The planes move up a row a turn: to read them at a row not known beforehand
+        # would take several times as long.
         @jax.checkpoint
-        def add_row(total: Planes, row: Array) -> tuple[Planes, None]:
-            strip = lax.dynamic_slice_in_dim(near, row, _TILE, axis=1)
-            dy = (row - reach).astype(near.dtype)
-            for column in range(window):
-                q = lax.slice_in_dim(strip, column, column + _TILE, axis=2)
-                away = (dy**2 + (column - reach) ** 2) / (2 * sigma**2)
-                weight = jnp.exp(-(distance(centre, q) + away))
-                total = total + weight[None] * q[: k + 1]
-            return total, None
+        def add_row(
+            carry: tuple[Planes, list[Planes]], dy: Array
+        ) -> tuple[tuple[Planes, list[Planes]], None]:
+            total, moved = carry
+            for dx in range(window):
+                q = [planes[:, :_TILE, dx : dx + _TILE] for planes in moved]
+                away = (dy**2 + (dx - reach) ** 2) / (2 * sigma**2)
+                weight = jnp.exp(-(_distance(centre[1:], q[1:]) + away))
+                total = total + weight[None] * q[0]
+            return (total, [jnp.roll(planes, -1, axis=1) for planes in moved]), None
 
-        total = jnp.zeros_like(centre[: k + 1])
-        return lax.scan(add_row, total, jnp.arange(window))[0]
+        dy = jnp.arange(window, dtype=image.dtype) - reach
+        start = jnp.zeros_like(centre[0]), list(near)
+        return lax.scan(add_row, start, dy)[0][0]
 
-    sums = sum_over_tiles(mean, [Region(planes, reach)], grid, reach=0)
+    sums = sum_over_tiles(mean, regions, grid, reach=0)
     sums = jnp.moveaxis(sums, 0, -1)
     weight = jnp.broadcast_to(sums[..., -1:], image.shape)
     return jnp.where(valid, divide(sums[..., :-1], weight, where=weight > 0), 0.0)
+
+
+def _distance(p: Sequence[Planes], q: Sequence[Planes]) -> Plane | float:
+    """What the guides of p and q make of their weight: -log k_pq but for |p - q|^2.
+
+    Plane by plane: a sum over an axis would not be vectorised.
+    """
+    (g_p, z_p, v_p), (g_q, z_q, v_q) = p, q
+    square, noise = jnp.square(z_p - z_q), v_p + v_q
+    known = _FARTHEST * noise > square
+    far = jnp.where(square > 0, _FARTHEST, jnp.zeros_like(square))
+    ratio = divide(square, noise, where=known, otherwise=far)
+    return sum([*jnp.square(g_p - g_q), *ratio])
