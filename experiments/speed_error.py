@@ -91,7 +91,7 @@ def parts(size: int) -> dict[str, Callable]:
     basis = jax.random.normal(key, (batch, FEATURES + 1, n))
     target, weights = basis[:, :CHANNELS], jax.random.uniform(key, (batch, m, n))
     guide = jax.random.uniform(key, (batch, 3, n))
-    inside = regression._inside(grid)
+    inside = grid.inside
     phi = jax.vmap(regression._products)(basis, target)
     b = jax.random.normal(key, (batch, (FEATURES + 1) * CHANNELS + 1, m))
 

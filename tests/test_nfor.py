@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import exr
-from jscomb.denoisers import nfor, nonlocal_means
+from jscomb.denoisers import nfor, nonlocal_means, rdfc
 from jscomb.frame import make_frame
 from jscomb.metrics import rel_l2
 from tests.conftest import DATA
@@ -17,10 +17,11 @@ SIZES = {"window": 7, "patch": 3}
 means = jax.jit(nonlocal_means.denoise, static_argnames=("window", "patch", "strength"))
 
 
-def means_by_loops(image, u, v, *, window, patch, strength):
-    """Every patch of every pair of pixels, in float64."""
-    size, r, f = np.array(image.shape[:2]), window // 2, patch // 2
-    valid = np.isfinite(np.concatenate([image, u, v], -1)).all(-1)
+def means_by_loops(image, u, v, f=None, *, window, patch, strength):
+    """Every patch of every pair of pixels, in float64; also of features if given."""
+    size, r, near = np.array(image.shape[:2]), window // 2, patch // 2
+    f = np.zeros((*size, 0)) if f is None else f
+    valid = np.isfinite(np.concatenate([image, u, v, f], -1)).all(-1)
     inside = lambda p: (p >= 0).all() and (p < size).all() and valid[tuple(p)]
 
     def distance(p, q):
@@ -31,8 +32,18 @@ def means_by_loops(image, u, v, *, window, patch, strength):
         near = square < 1e6 * noise
         return np.where(near, square / np.where(noise > 0, noise, 1), far).mean()
 
+    def slope(p, axis):
+        step = np.eye(2, dtype=int)[axis]
+        p, q = (tuple(np.clip(p + s, 0, size - 1)) for s in (step, -step))
+        known = np.isfinite([f[p], f[q]]).all()
+        return ((f[p] - f[q]) / 2) ** 2 if known else 0 * f[0, 0]
+
+    def unlike(p, q):
+        scale = 0.36 * np.maximum(slope(p, 0) + slope(p, 1), 1e-3)
+        return np.max((f[tuple(p)] - f[tuple(q)]) ** 2 / scale, initial=0)
+
     result = np.where(np.isfinite(image).all(-1, keepdims=True), image, 0.0)
-    offsets = [np.array(o) - f for o in np.ndindex(patch, patch)]
+    offsets = [np.array(o) - near for o in np.ndindex(patch, patch)]
     for p in np.argwhere(valid):
         total, weight = 0, 0
         for o in np.ndindex(window, window):
@@ -41,7 +52,7 @@ def means_by_loops(image, u, v, *, window, patch, strength):
                 continue
             pairs = [(p + s, q + s) for s in offsets]
             seen = [distance(a, b) for a, b in pairs if inside(a) and inside(b)]
-            w = np.exp(-max(0, np.mean(seen)))
+            w = np.exp(-max(0, np.mean(seen), unlike(p, q)))
             total, weight = total + w * image[tuple(q)], weight + w
         result[tuple(p)] = total / weight
     return result
@@ -69,6 +80,49 @@ def test_non_local_means_are_the_loops(broken):
     total = lambda *i: means(*i, **SIZES).sum()
     for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(*arrays):
         assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_rdfc_is_the_loops(broken):
+    data = (*noisy(), np.add.outer(np.arange(11), np.arange(19) % 7)[..., None] / 10)
+    if broken:
+        data[3][4, 9], data[0][6, 3, 1] = np.nan, np.inf
+    expected = means_by_loops(*data, **SIZES, strength=0.7)
+    run = jax.jit(lambda *i: rdfc.denoise(*i, **SIZES, strength=0.7))
+    for dtype, tolerance in ((np.float64, 1e-11), (np.float32, 1e-5)):
+        arrays = [jnp.asarray(d, dtype) for d in data]
+        np.testing.assert_allclose(
+            run(*arrays), expected, rtol=tolerance, atol=tolerance
+        )
+    total = lambda *i: run(*i).sum()
+    for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*arrays):
+        assert np.isfinite(gradient).all()
+
+
+def test_rdfc_of_a_frame():
+    """It lowers the error; without features it is non-local means."""
+    frame = exr.read_frame(DATA / "cornell-box-64.exr")
+    reference, noise = frame.reference
+    error = lambda image: rel_l2(image, reference, half_difference=noise)
+    bare = frame._replace(
+        buffers=frame.buffers._replace(
+            albedo=None, normal=None, depth=None, visibility=None
+        )
+    )
+    plain, denoised = (rdfc.denoise_frame(f, window=11) for f in (bare, frame))
+    x, v = frame.color, frame.variance
+    np.testing.assert_array_equal(plain.full, means(x, x, v, window=11))
+    assert error(denoised.full) < 0.3 * error(x)
+    for half, base in zip(frame.halves(), denoised.halves, strict=True):
+        assert error(base) < 0.3 * error(half.color)
+
+
+def test_rdfc_keeps_apart_what_the_noise_hides():
+    side = jnp.asarray(np.tile(np.arange(12)[:, None] > 5, (9, 1, 1)), float)
+    guide, variance = 0.1 * side, jnp.ones_like(side)
+    out = jax.jit(lambda *i: rdfc.denoise(*i, **SIZES))(side, guide, variance, side)
+    np.testing.assert_allclose(out, side, atol=1e-4)
+    assert float(jnp.abs(means(side, guide, variance, **SIZES) - side).max()) > 0.4
 
 
 def test_non_local_means_gradient():

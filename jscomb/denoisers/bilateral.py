@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jscomb.denoisers.parts import of_parts
 from jscomb.features import stack
 from jscomb.frame import Biased, Frame
 from jscomb.numerics.bilateral import bilateral_mean
@@ -86,7 +87,7 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
     Raises:
         ValueError: if the frame has no way to know the variance.
     """
-    one = lambda part: _denoise(part.color, part.variance, stack(part), window=window)
-    if frame.sub_buffers < (4 if frame.buffers.variance is None else 2):
-        return Biased(one(frame))
-    return Biased(one(frame), jnp.stack([one(half) for half in frame.halves()]))
+    return of_parts(
+        frame,
+        lambda part: _denoise(part.color, part.variance, stack(part), window=window),
+    )

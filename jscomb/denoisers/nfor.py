@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.denoisers import nonlocal_means
+from jscomb.denoisers.parts import of_parts
 from jscomb.features import select, stack
 from jscomb.frame import Biased, Frame
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
@@ -193,9 +194,7 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
         ValueError: if the frame has no sub-buffers, or no way to know the variance.
     """
     one = lambda part: _denoise_whole(part, window, stride)
-    if frame.sub_buffers < (8 if frame.buffers.variance is None else 4):
-        return Biased(one(frame))
-    return Biased(one(frame), jnp.stack([one(half) for half in frame.halves()]))
+    return of_parts(frame, one, halves=True)
 
 
 def _denoise_whole(frame: Frame, window: int, stride: int) -> Image:

@@ -24,16 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
-from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
-from jscomb.numerics.weights import Weights
+from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.tiles import Grid, Planes
+from jscomb.numerics.weights import Weights, weighted_mean
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image
 
 # A single pixel's distance at most: finite where the variance is 0, yet enough to keep
 # two patches apart that differ in one channel of one pixel.
 _FARTHEST = 1e6
-_TILE, _TILES = 16, 4
 
 
 def denoise(
@@ -66,26 +65,8 @@ def denoise(
     """
     if image.shape[:2] != guide.shape[:2]:
         raise ValueError(f"guide has shape {guide.shape}, image has {image.shape}")
-    kernel = weights(guide, variance, patch=patch, strength=strength)
-    valid = finite(image, kernel.image)
-    reach = check_window(window) // 2
-    grid = Grid(_TILE, 1, reach, _TILES)
-
-    def region(planes: Image, reach: int) -> Region:
-        return Region(jnp.moveaxis(jnp.where(valid, planes, 0.0), -1, 0), reach)
-
-    def mean(near: Planes, seen: Planes) -> Planes:
-        """Sums over the windows of a tile: of the image and of the weights."""
-        w = kernel.function(seen, grid)
-        total = jnp.einsum("kn,mn->km", flat(near), w, precision="highest")
-        return total.reshape(-1, _TILE, _TILE)
-
-    taken = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
-    regions = [region(taken, reach), region(kernel.image, reach + kernel.halo)]
-    sums = jnp.moveaxis(sum_over_tiles(mean, regions, grid, reach=0), 0, -1)
-    weight = jnp.broadcast_to(sums[..., -1:], image.shape)
-    result = divide(sums[..., :-1], weight, where=weight > 0)
-    return jnp.where(valid, result, first_finite(image))
+    alike = weights(guide, variance, patch=patch, strength=strength)
+    return weighted_mean(image, alike, window=window)
 
 
 def weights(

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import ArrayLike
 
+from jscomb.denoisers.parts import of_parts
 from jscomb.frame import Biased, Frame, make_frame
 from jscomb.numerics.guards import finite
 from jscomb.numerics.windows import window_mean
@@ -100,10 +101,7 @@ def denoise_frame(frame: Frame, *, features: bool = True) -> Biased:
             part.color, albedo=albedo, normal=normal, exposure=frame.exposure
         )
 
-    if frame.sub_buffers < 2:
-        return Biased(one(frame))
-    a, b = frame.halves()
-    return Biased(one(frame), jnp.stack([one(a), one(b)]))
+    return of_parts(frame, one, variance=False)
 
 
 def _fill(image: Array) -> Array:

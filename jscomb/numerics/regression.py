@@ -170,7 +170,7 @@ def joint_local_linear(
     images = [features, *(image for image, _ in targets), *(k.image for k in kernels)]
     valid = finite(*images)
     ridges = jnp.broadcast_to(jnp.asarray(ridge, features.dtype), features.shape[2:])
-    inside = _inside(grid)
+    inside = grid.inside
 
     def region(image: Image, reach: int) -> Region:
         return Region(jnp.moveaxis(jnp.where(valid, image, 0.0), -1, 0), reach)
@@ -275,13 +275,6 @@ def _scale(features: Image, valid: Mask, window: int) -> Image:
 
     planes = lax.map(jax.checkpoint(one), jnp.moveaxis(features, -1, 0))
     return jnp.moveaxis(planes, 0, -1)
-
-
-def _inside(grid: Grid) -> np.ndarray:
-    """Which pixels of a tile's neighbourhood lie in each centre's window, [M,N]."""
-    near = np.arange(grid.width(grid.reach)) - grid.reach
-    rows, columns = (abs(near - place[:, None]) <= grid.reach for place in grid.places)
-    return (rows[:, :, None] & columns[:, None, :]).reshape(len(rows), -1)
 
 
 def _grid(window: int, stride: int) -> Grid:

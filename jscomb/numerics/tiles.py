@@ -56,6 +56,15 @@ class Grid(NamedTuple):
         rows = np.add.outer(block * self.stride, shift)
         return np.stack([rows.ravel(), rows.T.ravel()])
 
+    @property
+    def inside(self) -> np.ndarray:
+        """Which pixels of a neighbourhood lie in each centre's window, [M,N]."""
+        near = np.arange(self.width(self.reach)) - self.reach
+        rows, columns = (
+            abs(near - place[:, None]) <= self.reach for place in self.places
+        )
+        return (rows[:, :, None] & columns[:, None, :]).reshape(len(rows), -1)
+
     def width(self, reach: int) -> int:
         """Width in pixels of a tile and what lies around it."""
         return self.step + 2 * reach

@@ -8,10 +8,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.tiles import Grid, Planes, flat
+from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
+from jscomb.numerics.windows import check_window
 from jscomb.typing import Scalar
+
+_TILE, _TILES = 16, 4
 
 
 class Weights(NamedTuple):
@@ -60,6 +65,98 @@ def gaussian_weights(
     return Weights(jnp.concatenate([guide, h], axis=-1), _gaussian_of_both)
 
 
+def feature_weights(
+    features: Float[Array, "h w f"], *, strength: float = 0.6, least: float = 1e-3
+) -> Weights:
+    """Weights exp(-max_f (f_i - f_c)^2 / (k^2 max(least, |grad f_c|^2))).
+
+    The gradient keeps slopes together, such as depth along a floor, that are no edges.
+
+    Args:
+        features: f, of a range of about one, shape [H,W,F], F at least 1.
+        strength: k > 0; larger calls more alike.
+        least: > 0, differences whose square is smaller count as none.
+
+    Returns:
+        the weights.
+
+    Raises:
+        ValueError: if `strength` or `least` is not positive.
+
+    Source: Rousselle et al. 2013, "Robust denoising using feature and color
+    information", eq. 6 to 8, for features without noise.
+    """
+    if not (strength > 0 and least > 0):
+        raise ValueError(f"strength = {strength} and least = {least} must be positive")
+    slope = jnp.maximum(sum(_square_slope(features, axis) for axis in (0, 1)), least)
+    return Weights(jnp.concatenate([features, strength**2 * slope], -1), _of_features)
+
+
+def least_of(first: Weights, second: Weights) -> Weights:
+    """The lesser of two weights: pixels must be alike in both ways.
+
+    Args:
+        first: some weights.
+        second: others, of an image of the same size.
+
+    Returns:
+        their minimum.
+    """
+    check_same_shape(first=first.image[..., :1], second=second.image[..., :1])
+    split, halo = first.image.shape[-1], max(first.halo, second.halo)
+
+    def inner(planes: Planes, own: int) -> Planes:
+        """Without what lies farther out than one of them wants."""
+        cut = slice(halo - own, planes.shape[1] - (halo - own))
+        return planes[:, cut, cut]
+
+    def function(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
+        one = first.function(inner(planes[:split], first.halo), grid)
+        other = second.function(inner(planes[split:], second.halo), grid)
+        return jnp.minimum(one, other)
+
+    image = jnp.concatenate([first.image, second.image], axis=-1)
+    return Weights(image, function, halo)
+
+
+def weighted_mean(
+    image: Float[Array, "h w _"], weights: Weights, *, window: int
+) -> Float[Array, "h w _"]:
+    """Mean over the window of each pixel. Pure, and differentiable in every array.
+
+    Args:
+        image: any unit, shape [H,W,C].
+        weights: of the pixels in the windows.
+        window: width in pixels, odd.
+
+    Returns:
+        the mean, shape [H,W,C]. Pixels that are not finite in image or weights take no
+        part; there the result is the image where it is finite, else 0.
+
+    Raises:
+        ValueError: while tracing, if the window is even.
+    """
+    valid = finite(image, weights.image)
+    reach = check_window(window) // 2
+    grid = Grid(_TILE, 1, reach, _TILES)
+
+    def region(planes: Float[Array, "h w _"], reach: int) -> Region:
+        return Region(jnp.moveaxis(jnp.where(valid, planes, 0.0), -1, 0), reach)
+
+    def mean(near: Planes, seen: Planes) -> Planes:
+        """Sums over the windows of a tile: of the image and of the weights."""
+        w = jnp.where(grid.inside, weights.function(seen, grid), 0.0)
+        total = jnp.einsum("kn,mn->km", flat(near), w, precision="highest")
+        return total.reshape(-1, _TILE, _TILE)
+
+    taken = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
+    regions = [region(taken, reach), region(weights.image, reach + weights.halo)]
+    sums = jnp.moveaxis(sum_over_tiles(mean, regions, grid, reach=0), 0, -1)
+    weight = jnp.broadcast_to(sums[..., -1:], image.shape)
+    result = divide(sums[..., :-1], weight, where=weight > 0)
+    return jnp.where(valid, result, first_finite(image))
+
+
 def _gaussian(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
     """exp(-|p_i - p_c|^2)."""
     return jnp.exp(-_square_distance(planes, grid))
@@ -71,6 +168,29 @@ def _gaussian_of_both(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
     (near,), (centre,) = flat(h), grid.centres(h)
     square = _square_distance(planes[:-1], grid)
     return jnp.exp(-2 * square / (near[None] + centre[:, None]))
+
+
+def _of_features(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
+    """exp(-max (f_i - f_c)^2 / s_c): features, then their s, which is above zero."""
+    f, s = jnp.split(planes, 2)
+    near, centre, scale = flat(f), grid.centres(f), grid.centres(s)
+    scale = jnp.where(scale > 0, scale, 1.0)  # 0 outside the image
+    far = jnp.zeros((centre.shape[1], near.shape[1]), planes.dtype)
+    for f_i, f_c, s_c in zip(near, centre, scale, strict=True):
+        far = jnp.maximum(far, jnp.square(f_i[None] - f_c[:, None]) / s_c[:, None])
+    return jnp.exp(-far)
+
+
+def _square_slope(features: Float[Array, "h w f"], axis: int) -> Float[Array, "h w f"]:
+    """Squared central difference along an axis; without pixels that are not finite."""
+    size = features.shape[axis]
+    at = lambda step: jnp.take(
+        features, np.clip(np.arange(size) + step, 0, size - 1), axis=axis
+    )
+    after, before = at(1), at(-1)
+    known = finite(after, before)
+    difference = jnp.where(known, after, 0.0) - jnp.where(known, before, 0.0)
+    return jnp.square(difference / 2)
 
 
 def _square_distance(planes: Planes, grid: Grid) -> Float[Array, "m n"]:

@@ -1,0 +1,95 @@
+r"""RDFC-style filter: non-local means in which features have a say as well.
+
+A pixel counts as far as its surroundings look the same *and* its features are the same:
+
+    w_pq = min(w_pq of non-local means on the radiance, w_pq of the features)
+
+The original mixes three such filters by an estimate of their errors; here `ensemble`
+mixes, so this is one of them.
+
+Source: F. Rousselle, M. Manzi, M. Zwicker, "Robust denoising using feature and color
+information", 2013.
+"""
+
+import jax
+from jaxtyping import Array, Float
+
+from jscomb.denoisers import nonlocal_means
+from jscomb.denoisers.parts import of_parts
+from jscomb.features import stack
+from jscomb.frame import Biased, Frame
+from jscomb.numerics.guards import check_same_shape
+from jscomb.numerics.weights import feature_weights, least_of, weighted_mean
+from jscomb.typing import Image, Variance
+
+
+def denoise(
+    image: Image,
+    guide: Image,
+    variance: Variance,
+    features: Float[Array, "h w f"],
+    *,
+    window: int = 21,
+    patch: int = 7,
+    strength: float = 0.5,
+    strength_features: float = 0.6,
+) -> Image:
+    """Replace each pixel by the mean of those alike in looks and in features.
+
+    Pure, differentiable in every array, and scale-equivariant.
+
+    Args:
+        image: radiance, shape [H,W,C]; the guide itself, or of the other half.
+        guide: radiance whose patches are compared, likewise.
+        variance: of the mean of the guide, squared radiance, shape [H,W,C].
+        features: of a range of about one, shape [H,W,F]; F may be 0.
+        window: width in pixels of the window that is searched, odd.
+        patch: width in pixels of the patches, odd.
+        strength: > 0 of the radiance; larger calls more alike.
+        strength_features: > 0, of the features.
+
+    Returns:
+        the mean, shape [H,W,C]. Pixels that are not finite in some input take no part;
+        there the result is the image where it is finite, else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or a width is even.
+    """
+    check_same_shape(image=image, guide=guide, variance=variance)
+    if features.shape[:2] != image.shape[:2]:
+        raise ValueError(f"features has shape {features.shape}, image {image.shape}")
+    alike = nonlocal_means.weights(guide, variance, patch=patch, strength=strength)
+    if features.shape[-1]:
+        same = feature_weights(features, strength=strength_features)
+        alike = least_of(alike, same)
+    return weighted_mean(image, alike, window=window)
+
+
+# Called with values, a loop over tiles would be compiled anew each time.
+_denoise = jax.jit(denoise, static_argnames="window")
+
+
+def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
+    """Denoise a frame with its albedo, normal and depth, and each of its halves.
+
+    Any of them may be missing; visibility is not used.
+
+    Args:
+        frame: with variances, or sub-buffers to estimate them from.
+        window: width of the windows in pixels, odd.
+
+    Returns:
+        the denoised frame; its halves if they have variances.
+
+    Raises:
+        ValueError: if the frame has no way to know the variance.
+    """
+
+    def one(part: Frame) -> Image:
+        # Visibility is a Monte Carlo estimate; its noise would pass for edges.
+        buffers = part.buffers._replace(visibility=None)
+        features = stack(part._replace(buffers=buffers))
+        x, v = part.color, part.variance
+        return _denoise(x, x, v, features, window=window)
+
+    return of_parts(frame, one)
