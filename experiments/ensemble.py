@@ -3,16 +3,17 @@
     python -m experiments.ensemble FOLDER --results FILE.json
 
 Every archive in the folder (see `frames`), at every sample count. Bases: Open Image
-Denoise with and without features, joint bilateral, Gaussian, non-local means; and the
-unbiased image. Relative L2, less the reference's noise, at an exposure of 1, divided by
-that of the best base: of the plain average, of one-hot choices, of weights from single
-pixels, windows, the frame and all scales, filtered or not, with each channel by itself,
-of either sign, and with the unbiased image among the bases. Then every subset of the
-bases with the same method, ranked as in the paper's table 3. Results are kept in the
-file as they come, and what is in it is not measured again.
+Denoise with and without features, joint bilateral, Gaussian, non-local means and RDFC;
+and the unbiased image. Relative L2, less the reference's noise, at an exposure of 1,
+divided by that of the best base, and time: of the plain average, of one-hot choices, of
+weights from single pixels, windows, the frame and all scales, filtered or not, with
+each channel by itself, of either sign, and with the unbiased image among the bases.
+Then every subset of the bases with the same method, ranked as in the paper's table 3.
+Results are kept in the file as they come, and what is in it is not measured again.
 """
 
 import dataclasses
+import functools
 import itertools
 import json
 import pathlib
@@ -25,9 +26,11 @@ import tyro
 from tqdm import tqdm
 
 from experiments import frames
+from experiments.bases import BASES, bases_of, stacked, unbiased_of
+from experiments.timing import medians
 from jscomb import ensemble
-from jscomb.denoisers import bilateral, nonlocal_means, oidn, smoothing
-from jscomb.frame import Biased, Frame
+from jscomb.denoisers import nonlocal_means
+from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import simplex
 from jscomb.typing import Image
@@ -48,46 +51,15 @@ class Config:
     quick: bool = False
 
 
-BASES = ("oidn", "oidn, no features", "bilateral", "gaussian", "non-local means")
 SCALED = {"solver": "multi-scale", "filter": False}
 
 means = jax.jit(nonlocal_means.denoise)
-gaussian = jax.jit(smoothing.gaussian)
-
-
-def bases_of(frame: Frame) -> list[Biased]:
-    """The bases of a frame and of its halves, in the order of `BASES`.
-
-    Args:
-        frame: with halves, variances, and Open Image Denoise's image.
-
-    Returns:
-        the biased images, with halves.
-    """
-
-    def each(denoise: Callable[[Frame], Image]) -> Biased:
-        full, *halves = (denoise(part) for part in (frame, *frame.halves()))
-        return Biased(full, jnp.stack(halves))
-
-    return [
-        frame.biased["oidn"],
-        oidn.denoise_frame(frame, features=False),
-        bilateral.denoise_frame(frame),
-        each(lambda part: gaussian(part.color)),
-        each(lambda part: means(part.color, part.color, part.variance)),
-    ]
-
-
-def stacked(bases: Sequence[Biased]) -> tuple[Image, Image, Image]:
-    """Full images, and those of both halves, [N,H,W,C] each."""
-    full, a, b = zip(*((i.full, *i.halves) for i in bases), strict=True)
-    return jnp.stack(full), jnp.stack(a), jnp.stack(b)
 
 
 def combined(**options) -> Callable:
     """`ensemble.combine` with some options, compiled."""
     return jax.jit(
-        lambda full, a, b, xa, xb, albedo, normal: ensemble.combine(
+        lambda full, a, b, xa, xb, v, albedo, normal: ensemble.combine(
             full, a, b, xa, xb, albedo=albedo, normal=normal, **options
         )
     )
@@ -96,8 +68,8 @@ def combined(**options) -> Callable:
 def weighed(weigh: Callable) -> Callable:
     """The ensemble with weights from the halves, compiled."""
     return jax.jit(
-        lambda full, *halves_and_guides: ensemble.average(
-            full, jnp.broadcast_to(weigh(*halves_and_guides[:4]), full.shape)
+        lambda full, *rest: ensemble.average(
+            full, jnp.broadcast_to(weigh(*rest[:4]), full.shape)
         )
     )
 
@@ -109,19 +81,57 @@ def over(*windows: int, whole_frame: bool = False) -> Callable:
     )
 
 
+def errors_of(*halves, window: int = 1, shared: bool = False):
+    """Estimated error of each base over a window, relative, [N,H,W,C or 1]."""
+    matrix = ensemble.error_matrix(
+        *halves, windows=(window,), whole_frame=False, shared=shared
+    )
+    return jnp.stack([m[k] for k, m in enumerate(matrix)])
+
+
 def one_hot(window: int) -> Callable:
     """The base of least error over a window."""
+    return lambda *halves: ensemble.one_hot(
+        errors_of(*halves, window=window, shared=True)
+    )
 
-    def weigh(*halves):
-        matrix = ensemble.error_matrix(*halves, windows=(window,), whole_frame=False)
-        return ensemble.one_hot(jnp.stack([m[k] for k, m in enumerate(matrix)]))
 
-    return weigh
+def smooth(images, a, b, albedo, normal):
+    """Images of all bases under the filter for weights, guided by the bases' mean."""
+    z, z_a, z_b = (jnp.mean(i, axis=0) for i in ((a + b) / 2, a, b))
+    noise = jnp.square(z_a - z_b) / 2
+    return ensemble.filter_weights(images, z, noise, albedo=albedo, normal=normal)
+
+
+@jax.jit
+def one_hot_bilateral(full, a, b, xa, xb, v, albedo, normal):
+    """The base of least error, errors filtered like weights."""
+    errors = smooth(errors_of(a, b, xa, xb), a, b, albedo, normal)
+    return ensemble.average(full, ensemble.one_hot(errors))
+
+
+@jax.jit
+def one_hot_means(full, a, b, xa, xb, v, albedo, normal):
+    """The base of least error, errors filtered by non-local means."""
+    errors = jnp.moveaxis(errors_of(a, b, xa, xb), 0, 2)
+    flat = errors.reshape(*xa.shape[:2], -1)
+    filtered = means(flat, (xa + xb) / 2, v).reshape(errors.shape)
+    return ensemble.average(full, ensemble.one_hot(jnp.moveaxis(filtered, 2, 0)))
+
+
+@jax.jit
+def one_hot_after(full, a, b, xa, xb, v, albedo, normal):
+    """The base of least error, and then its weights filtered."""
+    weights = ensemble.one_hot(errors_of(a, b, xa, xb))
+    return ensemble.average(full, smooth(weights, a, b, albedo, normal))
 
 
 METHODS = {
     "average": weighed(lambda a, *_: jnp.full_like(a, 1 / len(a))),
     "one-hot, pixel": weighed(one_hot(1)),
+    "one-hot, errors cross-bilateral": one_hot_bilateral,
+    "one-hot, errors non-local means": one_hot_means,
+    "one-hot, weights filtered": one_hot_after,
     "one-hot, 31x31": weighed(one_hot(31)),
     "pixel (the paper), no filter": combined(filter=False),
     "pixel, filtered (the paper)": combined(),
@@ -141,33 +151,40 @@ WITH_UNBIASED = (
     "31x31",
     "frame",
     "multi-scale",
+    "multi-scale, filtered",
 )
+SECONDS = ", seconds"
 
 
 def measure(frame: Frame) -> dict[str, float]:
-    """Relative L2 of the bases, of all methods, and of all subsets."""
+    """Relative L2 of the bases, of all methods with their time, and of all subsets."""
     assert frame.reference is not None
     r, noise = frame.reference
     error = lambda image: float(rel_l2(image, r, half_difference=noise))
     x_a, x_b = (half.color for half in frame.halves())
-    rest = x_a, x_b, frame.albedo, frame.normal
+    rest = x_a, x_b, frame.variance, frame.albedo, frame.normal
     bases = bases_of(frame)
-    unbiased = Biased(frame.color, jnp.stack([x_a, x_b]))
+    unbiased = unbiased_of(frame)
     row = {"path tracing": error(frame.color)}
     row |= {n: error(b.full) for n, b in zip(BASES, bases, strict=True)}
     some, more = stacked(bases), stacked([*bases, unbiased])
+
+    def add(name: str, method: Callable, images: Sequence[Image]) -> None:
+        call = functools.partial(method, *images, *rest)
+        row[name] = error(call())
+        row[name + SECONDS] = medians({name: call}, 3)[name]
+
     for name, method in METHODS.items():
-        row[name] = error(method(*some, *rest))
+        add(name, method, some)
         if name in WITH_UNBIASED:
-            row[f"{name} and x"] = error(method(*more, *rest))
-    for count in range(2, len(BASES)):
-        for subset in itertools.combinations(range(len(BASES)), count):
+            add(f"{name} and x", method, more)
+    ours, names = METHODS["multi-scale"], list(BASES)
+    for count in range(2, len(names)):
+        for subset in itertools.combinations(range(len(names)), count):
             images = stacked([bases[k] for k in subset])
-            name = " + ".join(BASES[k] for k in subset)
-            row[name] = error(METHODS["multi-scale"](*images, *rest))
+            row[" + ".join(names[k] for k in subset)] = error(ours(*images, *rest))
     chosen = ensemble.select_bases(some[1], some[2], x_a, x_b).kept
-    images = stacked([bases[k] for k in chosen])
-    row["selected"] = error(METHODS["multi-scale"](*images, *rest))
+    add("selected", ours, stacked([bases[k] for k in chosen]))
     row["selected, number"] = len(chosen)
     return row
 
@@ -225,13 +242,14 @@ def main() -> None:
     best = lambda row: min(row[base] for base in BASES)
     methods = [n for n in rows[0] if n in METHODS or n.endswith(" and x")]
     print(f"{'error / best base':<40}", end="")
-    print("".join(f"{c:>9}" for c in counts) + "    worst")
-    for name in (*methods, "selected"):
+    print("".join(f"{c:>9}" for c in counts) + "    worst  time / average's")
+    for name in (*BASES, *methods, "selected"):
         ratios = {c: [r[name] / best(r) for r in some] for c, some in at.items()}
         means_of = [np.exp(np.mean(np.log(each))) for each in ratios.values()]
         worst = max(max(each) for each in ratios.values())
         print(f"{name:<40}" + "".join(f"{m:>9.3f}" for m in means_of), end="")
-        print(f"{worst:>9.2f}")
+        spent = [r.get(name + SECONDS, np.nan) / r["average" + SECONDS] for r in rows]
+        print(f"{worst:>9.2f}{np.median(spent):>18.0f}")
     number = np.mean([row["selected, number"] for row in rows])
     print(f"selected: {number:.1f} of {len(BASES)} bases")
     subsets = [n for n in rows[0] if " + " in n] + [*BASES, "multi-scale"]

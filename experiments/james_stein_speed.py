@@ -9,9 +9,9 @@ second time. Medians; times of one machine mean nothing on another, ratios do.
 """
 
 import dataclasses
+import functools
 import os
 import pathlib
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -21,6 +21,7 @@ from collections.abc import Callable
 import jax
 import tyro
 
+from experiments.timing import medians
 from jscomb import james_stein
 from jscomb.cli import METHODS
 from jscomb.numerics.windows import window_sum
@@ -61,20 +62,13 @@ def run(config: Config) -> dict[str, float]:
             lambda *i: james_stein.combine(*i).sum(), argnums=(0, 1, 2)
         )(*i),
     }
-    compiled = {name: jax.jit(f) for name, f in functions.items()}
-    times: dict[str, list[float]] = {name: [] for name in compiled}
-    for repeat in range(repeats + 1):
-        for name, function in compiled.items():
-            start = time.perf_counter()
-            jax.block_until_ready(function(x, y, v))
-            if repeat:  # the first call compiles
-                times[name].append(time.perf_counter() - start)
-    medians = {name: statistics.median(each) for name, each in times.items()}
+    calls = {n: functools.partial(jax.jit(f), x, y, v) for n, f in functions.items()}
+    seconds = medians(calls, repeats)
     if not config.quick:
         with tempfile.TemporaryDirectory() as folder:
             for name in ("jscomb demo, first", "jscomb demo, second"):
-                medians[name] = _seconds_of_demo(pathlib.Path(folder))
-    return medians
+                seconds[name] = _seconds_of_demo(pathlib.Path(folder))
+    return seconds
 
 
 def _seconds_of_demo(folder: pathlib.Path) -> float:
@@ -88,9 +82,9 @@ def _seconds_of_demo(folder: pathlib.Path) -> float:
 
 def main() -> None:
     """Print the table."""
-    medians = run(tyro.cli(Config, description=__doc__))
-    ceiling = medians["two window sums"]
-    for name, seconds in medians.items():
+    found = run(tyro.cli(Config, description=__doc__))
+    ceiling = found["two window sums"]
+    for name, seconds in found.items():
         demo = name.startswith("jscomb")
         ratio = "" if demo else f"{seconds / ceiling:>9.2f} x the window sums"
         print(f"{name:<28}{1e3 * seconds:>10.2f} ms{ratio}")

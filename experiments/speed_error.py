@@ -16,8 +16,6 @@ import dataclasses
 import functools
 import itertools
 import pathlib
-import statistics
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 from unittest import mock
@@ -31,6 +29,7 @@ from tqdm import tqdm
 
 from experiments import frames
 from experiments.regression_error import inputs_of
+from experiments.timing import medians
 from jscomb import james_stein
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
@@ -58,26 +57,6 @@ class Config:
     repeats: int = 5
     plot: pathlib.Path | None = None
     quick: bool = False
-
-
-def medians(functions: dict[str, Callable], repeats: int) -> dict[str, float]:
-    """Median seconds of each function of no argument; they take turns.
-
-    Args:
-        functions: by name.
-        repeats: timed calls of each, after one to warm up.
-
-    Returns:
-        seconds by name.
-    """
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for repeat in range(repeats + 1):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            jax.block_until_ready(function())
-            if repeat:
-                times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(each) for name, each in times.items()}
 
 
 def parts(size: int) -> dict[str, Callable]:

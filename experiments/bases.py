@@ -1,0 +1,49 @@
+"""The bases of the ensemble experiments: six real denoisers, each with halves."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from jscomb.denoisers import bilateral, nonlocal_means, of_parts, oidn, rdfc, smoothing
+from jscomb.frame import Biased, Frame
+from jscomb.typing import Image
+
+_means = jax.jit(nonlocal_means.denoise)
+_gaussian = jax.jit(smoothing.gaussian)
+
+BASES: dict[str, Callable[[Frame], Biased]] = {
+    "oidn": lambda frame: frame.biased.get("oidn") or oidn.denoise_frame(frame),
+    "oidn, no features": lambda frame: oidn.denoise_frame(frame, features=False),
+    "bilateral": bilateral.denoise_frame,
+    "gaussian": lambda frame: of_parts(
+        frame, lambda part: _gaussian(part.color), variance=False
+    ),
+    "non-local means": lambda frame: of_parts(
+        frame, lambda part: _means(part.color, part.color, part.variance)
+    ),
+    "rdfc": rdfc.denoise_frame,
+}
+
+
+def bases_of(frame: Frame) -> list[Biased]:
+    """The bases of a frame and of its halves, in the order of `BASES`.
+
+    Args:
+        frame: with halves and variances; its own `oidn` is taken if it has one.
+
+    Returns:
+        the biased images, with halves.
+    """
+    return [make(frame) for make in BASES.values()]
+
+
+def unbiased_of(frame: Frame) -> Biased:
+    """The unbiased image as one more base."""
+    return of_parts(frame, lambda part: part.color, variance=False)
+
+
+def stacked(bases: Sequence[Biased]) -> tuple[Image, Image, Image]:
+    """Full images, and those of both halves, [N,H,W,C] each."""
+    full, a, b = zip(*((i.full, *i.halves) for i in bases), strict=True)
+    return jnp.stack(full), jnp.stack(a), jnp.stack(b)
