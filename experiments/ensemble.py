@@ -154,6 +154,22 @@ WITH_UNBIASED = (
     "multi-scale, filtered",
 )
 SECONDS = ", seconds"
+SHOWN = (
+    "average",
+    "one-hot, 31x31",
+    "pixel (the paper), no filter",
+    "pixel, filtered (the paper)",
+    "7x7",
+    "15x15",
+    "31x31",
+    "63x63",
+    "frame",
+    "multi-scale",
+    "multi-scale, filtered",
+    "multi-scale and x",
+    "multi-scale, filtered and x",
+    "selected",
+)
 
 
 def measure(frame: Frame) -> dict[str, float]:
@@ -237,27 +253,67 @@ def main() -> None:
     """Print the tables."""
     found = run(tyro.cli(Config, description=__doc__))
     rows = list(found.values())
-    counts = sorted({int(name.split()[-1]) for name in found})
-    at = {c: [r for n, r in found.items() if n.endswith(f" {c}")] for c in counts}
-    best = lambda row: min(row[base] for base in BASES)
-    methods = [n for n in rows[0] if n in METHODS or n.endswith(" and x")]
-    print(f"{'error / best base':<40}", end="")
-    print("".join(f"{c:>9}" for c in counts) + "    worst  time / average's")
-    for name in (*BASES, *methods, "selected"):
-        ratios = {c: [r[name] / best(r) for r in some] for c, some in at.items()}
-        means_of = [np.exp(np.mean(np.log(each))) for each in ratios.values()]
-        worst = max(max(each) for each in ratios.values())
-        print(f"{name:<40}" + "".join(f"{m:>9.3f}" for m in means_of), end="")
-        spent = [r.get(name + SECONDS, np.nan) / r["average" + SECONDS] for r in rows]
-        print(f"{worst:>9.2f}{np.median(spent):>18.0f}")
+    print_means(found)
+    print_frames(found)
+    print_scores(found)
     number = np.mean([row["selected, number"] for row in rows])
-    print(f"selected: {number:.1f} of {len(BASES)} bases")
+    share = np.median(
+        [r["selected" + SECONDS] / r["multi-scale" + SECONDS] for r in rows]
+    )
+    print(f"\nselected: {number:.1f} of {len(BASES)} bases, {share:.2f} of the time")
+
+
+def ratio(row: dict[str, float], name: str) -> float:
+    """Error divided by that of the best base."""
+    return row[name] / min(row[base] for base in BASES)
+
+
+def by_count(found: dict[str, dict[str, float]]) -> dict[int, list[dict[str, float]]]:
+    """The frames' errors by sample count, ascending."""
+    counts = sorted({int(name.split()[-1]) for name in found})
+    return {c: [r for n, r in found.items() if n.endswith(f" {c}")] for c in counts}
+
+
+def print_means(found: dict[str, dict[str, float]]) -> None:
+    """Geometric means over frames, the worst frame, and time."""
+    at, rows = by_count(found), list(found.values())
+    print("| error / best base |", " | ".join(map(str, at)), "| worst | time |")
+    print("| --- " * (len(at) + 3) + "|")
+    with_x = [f"{name} and x" for name in WITH_UNBIASED]
+    for name in (*BASES, *METHODS, *with_x, "selected"):
+        ratios = [[ratio(row, name) for row in some] for some in at.values()]
+        means_of = " | ".join(f"{np.exp(np.mean(np.log(r))):.3f}" for r in ratios)
+        own = [
+            r[name + SECONDS] / r["average" + SECONDS]
+            for r in rows
+            if name not in BASES
+        ]
+        time = f"{np.median(own):.0f}" if own else ""
+        print(f"| {name} | {means_of} | {max(map(max, ratios)):.2f} | {time} |")
+
+
+def print_frames(found: dict[str, dict[str, float]]) -> None:
+    """Every frame: errors of the bases, and what the ensembles make of them."""
+    names = [n for n in SHOWN if n in next(iter(found.values()))]
+    columns = ["frame", "path tracing", *BASES, *names]
+    print("\n|", " | ".join(columns), "|\n" + "| --- " * len(columns) + "|")
+    for frame, row in found.items():
+        bases = " | ".join(f"{row[base]:.5f}" for base in ("path tracing", *BASES))
+        ratios = " | ".join(f"{ratio(row, name):.3f}" for name in names)
+        print(f"| {frame} | {bases} | {ratios} |")
+
+
+def print_scores(found: dict[str, dict[str, float]]) -> None:
+    """Every subset of the bases, the best first."""
+    at, rows = by_count(found), list(found.values())
     subsets = [n for n in rows[0] if " + " in n] + [*BASES, "multi-scale"]
-    print(f"\nscores of {len(subsets)} candidates, the best first; by sample count")
-    each = {c: scores(some, subsets) for c, some in at.items()}
+    print("\n| bases | score |", " | ".join(map(str, at)), "|")
+    print("| --- " * (len(at) + 2) + "|")
+    each = [scores(some, subsets) for some in at.values()]
     for name, score in scores(rows, subsets).items():
-        by_count = "".join(f"{scored[name]:>7.1f}" for scored in each.values())
-        print(f"{name:<70}{score:>7.1f}{by_count}")
+        shown = "all six" if name == "multi-scale" else name
+        parts = " | ".join(f"{scored[name]:.1f}" for scored in each)
+        print(f"| {shown} | {score:.1f} | {parts} |")
 
 
 if __name__ == "__main__":

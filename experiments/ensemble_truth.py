@@ -1,14 +1,13 @@
 """How much of the ensemble's error comes from not knowing the bases' errors?
 
-    python -m experiments.render cornell-glossy --size 128 --spp 2048 --buffers 64 \
-        --reference-spp 16384 --no-denoise --out many.exr
-    python -m experiments.ensemble_truth many.exr
+    python -m experiments.ensemble_truth cornell-glass cornell-glossy --out FOLDER
 
-A frame of K sub-buffers is K/2 independent renderings with two halves each. All bases
-of all of them; from three quarters of the renderings the true error matrices, of the
-full images and of halves; on the others, by relative L2 less the reference's noise,
-divided by that of the best base: weights from the true matrices, from all estimates
-<M> of the three quarters together, and from what each rendering can tell by itself.
+Renders each scene many times over, with two halves each (work done so far is kept in
+the folder), and makes all bases of all renderings. From three quarters of them the true
+error matrices, of the full images and of halves; on the others, by relative L2 less the
+reference's noise, divided by that of the best base: weights from the true matrices,
+from all estimates <M> of the three quarters together, and from what each rendering can
+tell by itself.
 """
 
 import dataclasses
@@ -19,8 +18,9 @@ import jax.numpy as jnp
 import tyro
 from tqdm import tqdm
 
+from experiments import render
 from experiments.bases import BASES, bases_of, stacked
-from jscomb import ensemble, exr
+from jscomb import ensemble
 from jscomb.frame import Buffers, Frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import simplex
@@ -31,12 +31,35 @@ class Config:
     """What to measure.
 
     Attributes:
-        frames: EXR files of `experiments.render` with many sub-buffers and a reference.
-        quick: only the first eight sub-buffers.
+        scenes: names of scenes, see `experiments.scenes`.
+        out: folder for the work done so far.
+        renderings: of each scene, at least four.
+        samples: samples a pixel of each rendering.
+        size: width and height in pixels.
+        reference_spp: samples a pixel of the reference.
     """
 
-    frames: tyro.conf.Positional[tuple[pathlib.Path, ...]]
-    quick: bool = False
+    scenes: tyro.conf.Positional[tuple[str, ...]]
+    out: pathlib.Path
+    renderings: int = 32
+    samples: int = 64
+    size: int = 128
+    reference_spp: int = 16384
+
+
+def rendered(config: Config, scene: str) -> Frame:
+    """One frame with two sub-buffers for each rendering."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    whole = render.Config(
+        scene,
+        config.out / f"{scene}.exr",
+        spp=config.renderings * config.samples,
+        size=config.size,
+        buffers=2 * config.renderings,
+        feature_spp=4,
+        reference_spp=config.reference_spp,
+    )
+    return render.assemble(whole, render.render(whole))
 
 
 def renderings_of(frame: Frame) -> list[Frame]:
@@ -92,16 +115,15 @@ def true_weights(full, a, b, x_a, x_b, truth):
     return {name: simplex.quadratic(m) for name, m in matrices.items()}
 
 
-def measure(path: pathlib.Path, *, quick: bool = False) -> dict[str, float]:
+def measure(config: Config, scene: str) -> dict[str, float]:
     """Relative L2 by method, mean over the judged renderings."""
-    frame = exr.read_frame(path, statistics=False)
-    if frame.reference is None or frame.sub_buffers < 8:
-        raise ValueError(f"{path}: needs a reference and at least 8 sub-buffers")
+    frame = rendered(config, scene)
     frame = frame.scaled(1 / frame.exposure)
+    assert frame.reference is not None
     truth, noise = frame.reference
-    every = renderings_of(frame)[: 4 if quick else None]
+    every = renderings_of(frame)
     bases, unbiased = [], []
-    for rendering in tqdm(every, unit="rendering", desc=path.stem):
+    for rendering in tqdm(every, unit="rendering", desc=scene):
         bases.append(stacked(bases_of(rendering)))
         unbiased.append([half.color for half in rendering.halves()])
     full, a, b = (jnp.stack(i) for i in zip(*bases, strict=True))
@@ -119,18 +141,15 @@ def measure(path: pathlib.Path, *, quick: bool = False) -> dict[str, float]:
 
 
 def run(config: Config) -> dict[str, dict[str, float]]:
-    """Measure every frame.
+    """Measure every scene.
 
     Args:
         config: what to measure.
 
     Returns:
-        relative L2 by file and method.
-
-    Raises:
-        ValueError: if a file has too few sub-buffers, or no reference.
+        relative L2 by scene and method.
     """
-    return {p.stem: measure(p, quick=config.quick) for p in config.frames}
+    return {scene: measure(config, scene) for scene in config.scenes}
 
 
 def main() -> None:

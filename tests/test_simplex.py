@@ -196,6 +196,19 @@ def test_quadratic_is_optimal(n, rank):
     assert abs(value(np.asarray(single, np.float64)) - value(w)).max() < 1e-4
 
 
+def test_a_matrix_that_is_not_semidefinite():
+    """No estimate is one, but rounding may make one: feasible weights, gradients."""
+    a, d = RNG.normal(size=(6, 6, 6000)), RNG.normal(size=(6, 6000))
+    matrix = np.einsum("im,jm->ijm", d, d) * (1 + a + a.transpose(1, 0, 2))
+    for dtype in (jnp.float32, jnp.float64):
+        m = jnp.asarray(matrix, dtype)
+        w = np.asarray(quadratic(m))
+        assert w.min() >= 0
+        np.testing.assert_allclose(w.sum(0), 1, atol=1e-6)
+        gradient = jax.jit(jax.grad(lambda m: jnp.sum(jnp.sin(simplex.quadratic(m)))))
+        assert np.isfinite(gradient(m)).all()
+
+
 def test_a_bad_base_does_not_drown_two_good_ones():
     good = np.array([[1.0, 0.2], [0.2, 2.0]])
     matrix = np.full((3, 3), 0.1)

@@ -66,7 +66,8 @@ def bilateral_mean(
     reach = check_window(window) // 2
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
-    grid = Grid(_TILE, 1, reach, _TILES)
+    tile = min(_TILE, max(image.shape[:2]))
+    grid = Grid(tile, 1, reach, _TILES)
     valid = finite(image, guide, noisy, variance)
     ones = jnp.ones_like(valid, image.dtype)
     # Where not valid the ones are 0 as well, so those pixels are not counted.
@@ -77,7 +78,7 @@ def bilateral_mean(
 
     def mean(*near: Planes) -> Planes:
         """Sums over the windows of a tile: of the images and of the weights."""
-        middle = slice(reach, reach + _TILE)
+        middle = slice(reach, reach + tile)
         centre = [planes[:, middle, middle] for planes in near]
 
         # The planes move up a row a turn: to read them at a row not known beforehand
@@ -88,7 +89,7 @@ def bilateral_mean(
         ) -> tuple[tuple[Planes, list[Planes]], None]:
             total, moved = carry
             for dx in range(window):
-                q = [planes[:, :_TILE, dx : dx + _TILE] for planes in moved]
+                q = [planes[:, :tile, dx : dx + tile] for planes in moved]
                 away = (dy**2 + (dx - reach) ** 2) / (2 * sigma**2)
                 weight = jnp.exp(-(_distance(centre[1:], q[1:]) + away))
                 total = total + weight[None] * q[0]

@@ -54,6 +54,18 @@ def least_weight(w: Flat) -> float:
     return -32 * float(jnp.finfo(w.dtype).eps)
 
 
+def is_sound(w: Flat) -> Bool[Array, " m"]:
+    """Whether weights have a sum of one, but for rounding.
+
+    Args:
+        w: weights of either sign, shape [N,M].
+
+    Returns:
+        False for a problem so far from convex that its minimum is lost, shape [M].
+    """
+    return jnp.abs(jnp.sum(w, axis=0) - 1) < 0.5
+
+
 def search(
     minimise: Callable[[Free], tuple[Flat, Flat]],
     start: Flat,
@@ -61,6 +73,8 @@ def search(
     active: Bool[Array, " m"],
 ) -> tuple[Flat, Free]:
     """Minimise convex quadratic functions of nonnegative weights.
+
+    One that is not convex, so that a minimum is lost, keeps its start.
 
     From feasible weights towards the minimum of the free ones, until one of them
     becomes zero and is fixed; at the minimum the fixed weight with the steepest descent
@@ -79,7 +93,7 @@ def search(
         the weights, and which of them are free.
     """
     n, least = len(start), least_weight(start)
-    number = jnp.arange(n)[:, None]
+    number, start_free = jnp.arange(n)[:, None], free
 
     def unfinished(state: tuple) -> Array:
         step, *_, active = state
@@ -88,6 +102,7 @@ def search(
     def advance(state: tuple) -> tuple:
         step, w, free, fresh, active = state
         minimum, slope = minimise(free)
+        sound = is_sound(minimum) & jnp.all(jnp.isfinite(slope), axis=0)
         blocking = free & (minimum < least)
         reach = divide(w, w - minimum, where=blocking, otherwise=jnp.inf)
         share = jnp.minimum(jnp.min(reach, axis=0, keepdims=True), 1.0)
@@ -96,14 +111,15 @@ def search(
         slope = jnp.where(free, jnp.inf, slope)
         arrived, steepest = share >= 1, jnp.argmin(slope, axis=0, keepdims=True)
         freed = arrived & (slope < 0) & (number == steepest)
-        moves = active[None]
+        moves, given_up = (active & sound)[None], (active & ~sound)[None]
         done = (arrived[0] & ~jnp.any(freed, axis=0)) | jnp.any(fresh & fixed, axis=0)
+        after, free_after = jnp.where(moves, moved, w), (free & ~fixed) | freed
         return (
             step + 1,
-            jnp.where(moves, moved, w),
-            jnp.where(moves, (free & ~fixed) | freed, free),
+            jnp.where(given_up, start, after),
+            jnp.where(given_up, start_free, jnp.where(moves, free_after, free)),
             freed,
-            active & ~done,
+            active & sound & ~done,
         )
 
     state = (0, start, free, jnp.zeros_like(free), active)

@@ -12,6 +12,7 @@ from jscomb.numerics.simplex.active_set import (
     Flat,
     Free,
     in_chunks,
+    is_sound,
     least_weight,
     search,
     shared_by_equals,
@@ -28,7 +29,9 @@ def quadratic(matrix: Matrix) -> Weights:
     told apart get the same weight.
 
     Args:
-        matrix: M, any unit, shape [N,N,...].
+        matrix: M, any unit, shape [N,N,...]; semidefinite on differences of weights,
+            as estimates from halves are. Where rounding has left nothing of that, the
+            weights are feasible, and may be those of the best base alone.
 
     Returns:
         the weights, shape [N,...].
@@ -63,7 +66,8 @@ def _least(matrix: Float[Array, "n n m"]) -> Flat:
 
     active = jnp.ones(start.shape[1:], bool)
     found, free = search(minimise, start.astype(matrix.dtype), start, active)
-    w, _ = _minimum(objective, free)
+    sound = is_sound(_minimum(fixed, free)[0])
+    w, _ = _minimum(objective, jnp.where(sound[None], free, start))
     feasible = jnp.all(w >= least_weight(w), axis=0)
     w = jnp.where(feasible[None], jnp.maximum(w, 0.0), found)
     w = shared_by_equals(w, jnp.all(matrix[:, None] == matrix[None], axis=2))
