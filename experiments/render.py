@@ -18,7 +18,7 @@ import pathlib
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -136,19 +136,17 @@ def passes(config: Config) -> Iterator[Pass]:
         seed += 1
 
 
-def render(config: Config) -> dict[str, Moments]:
-    """Run all passes, or those that an interrupted run has left.
+def launcher(config: Config) -> Callable[[Pass], np.ndarray]:
+    """Load a scene.
 
     Args:
-        config: what to render.
+        config: which one, and its size.
 
     Returns:
-        the moments of every target in float64: `color0`, ..., `aov0`, ...,
-        `visibility0`, ..., `reference0`, `reference1`.
+        a function that renders one pass of it, [H,W,...] in float64.
 
     Raises:
-        ValueError: if the scene is unknown, or the partial file on disk belongs to
-            another configuration.
+        ValueError: if the scene is unknown, or a borrowed reference does not fit it.
     """
     mi = scenes.mitsuba()
     width, height = config.width or config.size, config.height or config.size
@@ -175,19 +173,49 @@ def render(config: Config) -> dict[str, Moments]:
         )
         return np.asarray(image, np.float64)
 
+    return launch
+
+
+def render(config: Config) -> dict[str, Moments]:
+    """The moments of every target after all passes, see `steps`."""
+    *_, (_, moments) = steps(config)
+    return moments
+
+
+def steps(
+    config: Config, todo: Sequence[Pass] | None = None
+) -> Iterator[tuple[int, dict[str, Moments]]]:
+    """Run all passes, or those that an interrupted run has left.
+
+    Args:
+        config: what to render.
+        todo: the passes in their order; None for `passes(config)`.
+
+    Yields:
+        after each pass (and first what an interrupted run has left, if anything) how
+        many are done, and the moments of every target so far in float64: `color0`,
+        ..., `aov0`, ..., `visibility0`, ..., `reference0`, `reference1`.
+
+    Raises:
+        ValueError: if the scene is unknown, or the partial file on disk belongs to
+            another configuration.
+    """
+    launch = launcher(config)
     partial = _Partial(config)
     done, moments = partial.load()
-    todo = list(passes(config))
+    todo = list(passes(config)) if todo is None else todo
     progress = tqdm(total=sum(p.spp for p in todo), unit="spp", desc=config.scene)
     progress.update(sum(p.spp for p in todo[:done]))
+    if done:
+        yield done, moments
     for number, p in enumerate(todo[done:], done + 1):
         image = launch(p)
         empty = Moments(0, np.zeros_like(image), np.zeros_like(image))
         moments[p.target] = moments.get(p.target, empty).add(image)
         progress.update(p.spp)
         partial.save(number, moments, last=number == len(todo))
+        yield number, moments
     progress.close()
-    return moments
 
 
 def assemble(config: Config, moments: dict[str, Moments]) -> Frame:

@@ -16,5 +16,6 @@ from jscomb import frame as frame
 from jscomb import james_stein as james_stein
 from jscomb import metrics as metrics
 from jscomb import numerics as numerics
+from jscomb import progressive as progressive
 
 __version__ = "0.1.0"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import ensemble, james_stein
+from jscomb import ensemble, james_stein, progressive
 from jscomb.cli import METHODS
 from jscomb.denoisers import smoothing
 
@@ -28,9 +28,15 @@ COMBINERS = {
     "james_stein dual": lambda x, y, v: james_stein.combine_dual(
         x, 2 * x - y, y, (x + y) / 2, v
     ),
+    "james_stein corrected": lambda x, y, v: james_stein.combine(
+        x, y, v, whiten=True, divergence=v / 4
+    ),
     "ensemble": lambda x, y, v: ensemble_of(x, y, v),
     "ensemble multi-scale": lambda x, y, v: ensemble_of(
         x, y, v, solver="multi-scale", windows=(7, 11)
+    ),
+    "progressive": lambda x, y, v: progressive.combine(
+        x, y, v, jnp.square(y - x) - v / 2
     ),
     **{f"command, {name}": method for name, method in METHODS.items()},
 }
@@ -134,8 +140,11 @@ def test_a_bad_pixel_stays_local(combine, images, image, bad, request):
     reach = 20  # windows of a window, and pooling before them
     rows, columns = np.ogrid[:64, :64]
     far = (abs(rows - 20) > reach) | (abs(columns - 30) > reach)
-    if "multi-scale" in request.node.name:  # the frame is one of its scales
-        np.testing.assert_allclose(out[far], clean[far], rtol=0.02, atol=1e-3)
+    # The frame is one of the scales; its mean noise sets the bound's width.
+    by_frame = {"multi-scale": 0.02, "progressive": 1e-4}
+    loose = [r for name, r in by_frame.items() if name in request.node.name]
+    if loose:
+        np.testing.assert_allclose(out[far], clean[far], rtol=loose[0], atol=1e-3)
     else:
         np.testing.assert_array_equal(out[far], clean[far])
     _, gradients = combine.gradient(*poisoned)

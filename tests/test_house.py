@@ -21,6 +21,7 @@ ROOMS = [
     "metrics",
     "james_stein",
     "ensemble",
+    "progressive",
     "denoisers",
     "exr",
     "plots",
@@ -28,7 +29,7 @@ ROOMS = [
     "__main__",
     "jscomb",
 ]
-COMBINERS = {"james_stein", "ensemble"}
+COMBINERS = {"james_stein", "ensemble", "progressive"}
 ROOT = pathlib.Path(__file__).parents[1]
 MODULES = [
     importlib.import_module(m.name)

@@ -7,6 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import james_stein
+from jscomb.numerics import sure
 from tests.statistics import assert_mean, assert_mean_below
 from tests.test_windows import near
 
@@ -19,9 +20,11 @@ def finite(*images):
     return np.all([np.isfinite(i).all(axis=-1) for i in images], axis=0)
 
 
-def oracle(x, y, v, window, whiten):
+def oracle(x, y, v, window, whiten, divergence=None):
     """The definition, pixel by pixel, in NumPy float64."""
     x, y, v = (np.asarray(i, np.float64) for i in (x, y, v))
+    in_common = np.zeros_like(x) if divergence is None else np.asarray(divergence)
+    missing = 2 if divergence is None else 0
     valid = finite(x, y, v)
     share = np.full_like(x, np.nan)
     for i, j, c in np.ndindex(*x.shape):
@@ -30,14 +33,15 @@ def oracle(x, y, v, window, whiten):
         at = near(i, j, x.shape, window)
         members = valid[at]
         square = (x[at] - y[at])[members, c] ** 2
-        variance = v[at][members, c]
+        variance, common = v[at][members, c], in_common[at][members, c]
         if whiten:
             counted = variance > 0
             p, energy = counted.sum(), np.sum(square[counted] / variance[counted])
-            noise = max(p - 2, 0)
+            common = np.sum(common[counted] / variance[counted])
+            noise = max(p - missing - common, 0)
         else:
             p, energy = members.sum(), square.sum()
-            noise = max(p - 2, 0) * v[i, j, c]
+            noise = max((p - missing) * v[i, j, c] - common.sum(), 0)
         lost = (1.0 if energy <= 0 else min(1.0, noise / energy)) if noise > 0 else 0.0
         share[i, j, c] = 1 - lost
     out = np.where(finite(y)[..., None], y, np.where(finite(x)[..., None], x, 0))
@@ -65,6 +69,58 @@ def test_matches_the_definition(shape, window, whiten):
             lambda *i: james_stein.combine(*i, window=window, whiten=whiten)
         )
         np.testing.assert_allclose(combine(*data), expected, rtol=1e-12, atol=1e-15)
+
+
+@BOTH
+def test_matches_the_definition_with_a_divergence(whiten):
+    x, y, v = images((9, 8, 2))
+    divergence = v * jax.random.uniform(jax.random.key(9), v.shape, minval=-1, maxval=2)
+    x, v = x.at[2, 3, 1].set(np.nan), v.at[5].set(0.0)
+    expected = oracle(x, y, v, 5, whiten, divergence)
+    found = james_stein.combine(x, y, v, window=5, whiten=whiten, divergence=divergence)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
+
+
+@BOTH
+def test_the_divergence_mends_what_a_denoiser_costs(whiten):
+    """A y that is half x, half wrong: taken as independent of x, too much is used."""
+    truth = jnp.asarray(1 + np.add.outer(np.arange(20), np.arange(20))[..., None] / 9)
+    denoise = lambda x: (x + truth + 0.5) / 2
+
+    @jax.jit
+    def one(key):
+        a, b = jax.random.split(key)
+        x = truth + 0.3 * jax.random.normal(a, truth.shape, truth.dtype)
+        v = jnp.full_like(x, 0.09)
+        y, _, divergence = sure.monte_carlo_sure(b, denoise, x, v)
+        run = lambda **options: james_stein.combine(x, y, v, whiten=whiten, **options)
+        error = lambda image: jnp.mean((image - truth) ** 2)
+        return error(run(divergence=divergence)), error(run()), error(x), error(y)
+
+    found = jax.lax.map(one, jax.random.split(jax.random.key(0), 500), batch_size=50)
+    corrected, *others = found
+    for other in others:
+        assert_mean_below(corrected - other, 0)
+
+
+@BOTH
+def test_an_image_that_is_the_rendering_keeps_its_noise(whiten):
+    """A denoiser that does nothing has the whole variance in common."""
+    x, y, v = images((6, 7, 2))
+    found = james_stein.combine(x, y, v, window=3, whiten=whiten, divergence=v)
+    if whiten:
+        np.testing.assert_allclose(found, x, rtol=1e-12)
+    same = james_stein.combine(x, x, v, window=3, whiten=whiten, divergence=v)
+    np.testing.assert_allclose(same, x, rtol=1e-12)
+
+
+@BOTH
+def test_gradients_with_a_divergence(whiten):
+    x, y, v = images((5, 6, 1))
+    run = lambda *i: james_stein.combine(
+        *i[:3], window=3, whiten=whiten, divergence=i[3]
+    )
+    check_grads(jax.jit(run), (x, y, v, v / 3), order=1, modes=["rev"])
 
 
 @BOTH

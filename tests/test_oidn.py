@@ -1,5 +1,6 @@
 """Open Image Denoise behind its guard: real filter, real frames, ugly pixels."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +8,8 @@ import pytest
 from jscomb import metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import make_frame
+from jscomb.metrics import rel_l2
+from jscomb.numerics import sure
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +86,37 @@ def test_rejects_bad_input(glass_frame, monkeypatch):
     monkeypatch.setattr(oidn, "available", lambda: False)
     with pytest.raises(ImportError, match=r'pip install "jscomb\[oidn\]"'):
         oidn.denoise(color)
+
+
+def test_it_is_a_jax_function(glass_frame, denoised):
+    """Compiled, mapped, and with a forward derivative that is linear."""
+    frame = glass_frame
+    run = lambda x: oidn.denoise(
+        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.exposure
+    )
+    x = frame.color
+    np.testing.assert_allclose(jax.jit(run)(x), denoised.full, rtol=1e-6)
+    both = jax.jit(jax.vmap(run))(jnp.stack([x, x[::-1]]))
+    np.testing.assert_allclose(both[0], denoised.full, rtol=1e-6)
+    derivative = jax.jit(lambda x, t: jax.jvp(run, (x,), (t,)))
+    y, moved = derivative(x, x)
+    np.testing.assert_allclose(y, denoised.full, rtol=1e-6)
+    # Scaling the image scales the result, but for the filter's own nonlinearity.
+    assert rel_l2(moved, y) < 0.05
+    for scale in (1e-4, 1e4):
+        _, other = derivative(x, scale * x)
+        np.testing.assert_allclose(other / scale, moved, rtol=0.02, atol=2e-3)
+
+
+def test_sure_of_it_is_that_of_the_frame(glass_frame):
+    """The mean estimate is the mean error, to a few percent, without a reference."""
+    frame = glass_frame.scaled(1 / glass_frame.exposure)
+    r, noise = frame.reference
+    run = lambda x: oidn.denoise(x, albedo=frame.albedo, normal=frame.normal)
+    risk = sure.monte_carlo_sure(
+        jax.random.key(0), run, frame.color, frame.variance, probes=2
+    )
+    weight = 1 / (jnp.mean(r, axis=-1, keepdims=True) ** 2 + 1)
+    mean = lambda square: float(jnp.mean(weight * square))
+    truth = mean((risk.denoised - r) ** 2 - noise**2 / 4)
+    assert 0.9 * truth < mean(risk.squared_error) < 1.1 * truth

@@ -3,24 +3,30 @@
 The filter is not scale-equivariant at very low radiance, one infinite pixel spreads
 far, and NaN counts as black. So the image is brought to an exposure of one first (and
 back after), and each pixel that is not finite is filled from its neighbours before the
-filter sees it. Images [H,W,3], linear radiance. NumPy at the edge: not for `jit`.
+filter sees it. Images [H,W,3], linear radiance.
+
+A function for `jit`, `vmap` (one image after the other) and forward derivatives: the
+filter itself runs on the host, and its derivative is a central difference. It has no
+reverse derivative.
 
 Needs the extra `oidn` (`pip install "jscomb[oidn]"`).
 """
 
 import importlib.util
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import ArrayLike
 
 from jscomb.denoisers.parts import of_parts
 from jscomb.frame import Biased, Frame, make_frame
 from jscomb.numerics.guards import finite
-from jscomb.numerics.windows import window_mean
+from jscomb.numerics.windows import window_max, window_mean
 
 _LARGEST = 1e5  # radiance over exposure; beyond, the filter's half floats overflow
+_STEP = 0.03  # of a difference, relative to the typical pixel
 
 
 def available() -> bool:
@@ -58,8 +64,6 @@ def denoise(
     """
     if not available():
         raise ImportError('Open Image Denoise is missing: pip install "jscomb[oidn]"')
-    import pyoidn
-
     image = jnp.asarray(color, jnp.float32)
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise ValueError(f"color must have shape [H,W,3], got {image.shape}")
@@ -71,11 +75,49 @@ def denoise(
             clean = _fill(jnp.asarray(feature, jnp.float32))
             if clean.shape != image.shape:
                 raise ValueError(f"{name} has shape {clean.shape}, not {image.shape}")
-            features[name] = np.asarray(jnp.clip(clean, least, 1.0))
+            features[name] = jnp.clip(clean, least, 1.0)
     scale = make_frame(image).exposure if exposure is None else jnp.asarray(exposure)
+    scale = scale.astype(jnp.float32)
     scaled = jnp.clip(_fill(image) / scale, 0.0, _LARGEST)
-    result = pyoidn.denoise(np.asarray(scaled), hdr=True, **features)
-    return jnp.asarray(result) * scale
+    return _filter(scaled, features) * scale
+
+
+@jax.custom_jvp
+def _filter(color: Array, features: dict[str, Array]) -> Array:
+    """The filter on the host, [H,W,3]."""
+    shape = jax.ShapeDtypeStruct(color.shape, jnp.float32)
+    return jax.pure_callback(_on_host, shape, color, features, vmap_method="sequential")
+
+
+def _on_host(color: ArrayLike, features: dict[str, ArrayLike]) -> np.ndarray:
+    """The filter on NumPy arrays."""
+    import pyoidn
+
+    guides = {name: np.asarray(feature) for name, feature in features.items()}
+    result = pyoidn.denoise(
+        np.asarray(color), guides.get("albedo"), guides.get("normal"), hdr=True
+    )
+    return np.asarray(result, np.float32)
+
+
+@_filter.defjvp
+def _filter_jvp(
+    primals: tuple[Array, dict[str, Array]], tangents: tuple[Array, dict[str, Array]]
+) -> tuple[Array, Array]:
+    """Central difference; its step moves the typical pixel by `_STEP` of its value.
+
+    The typical one of those that move at all: with the largest as measure the steps of
+    all others would be lost to rounding beside a firefly.
+    """
+    size = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(primals)])
+    speed = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(tangents)])
+    relative = jnp.where(speed > 0, speed / (size + 1), jnp.nan)
+    typical = jnp.nanmedian(relative)
+    step = jnp.where(typical > 0, _STEP / jnp.where(typical > 0, typical, 1.0), 1.0)
+    at = lambda side: _filter(
+        *jax.tree.map(lambda p, t: p + side * step * t, primals, tangents)
+    )
+    return _filter(*primals), (at(1.0) - at(-1.0)) / (2 * step)
 
 
 def denoise_frame(frame: Frame, *, features: bool = True) -> Biased:
@@ -105,13 +147,15 @@ def denoise_frame(frame: Frame, *, features: bool = True) -> Biased:
 
 
 def _fill(image: Array) -> Array:
-    """Pixels that are not finite become the mean of a window of finite ones."""
+    """Pixels that are not finite become the mean of finite neighbours, ring by ring."""
     valid = finite(image)
-    filled = jnp.where(valid, image, 0.0)
-    missing, window = ~valid, 3
-    while bool(missing.any()) and bool(valid.any()) and window < 2 * max(image.shape):
-        near = window_mean(image, window, mask=valid)
-        reached = window_mean(valid.astype(image.dtype), window) > 0
-        filled = jnp.where(missing & reached, near, filled)
-        missing, window = missing & ~reached, 2 * window + 1
-    return filled
+
+    def ring(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        filled, known = state
+        near = window_mean(filled, 3, mask=known)
+        reached = window_max(known.astype(image.dtype), 3) > 0
+        return jnp.where(known, filled, near), reached
+
+    some_left = lambda state: jnp.any(state[1]) & ~jnp.all(state[1])
+    start = jnp.where(valid, image, 0.0), valid
+    return lax.while_loop(some_left, ring, start)[0]

@@ -23,6 +23,11 @@ a lower expected squared error than x, whatever y is: summed over the window for
 variances, and in units of the variance for the whitened rule, which needs no equality.
 A denoised y does depend on x, and path-traced noise is not Gaussian, so in practice
 neither is a guarantee: at low sample counts a good denoiser alone is often better.
+The first is mended by the divergence of the denoiser, D_i = (J Sigma)_ii: then
+
+    eta_c = (1 - sum_i (v_i - D_i) / sum_i (x_i - y_i)^2)+
+
+has the least expected error that Stein's lemma knows (whitened: each i over v_i).
 
 A window of fewer than three pixels has nothing to borrow from and keeps x, and so does
 one without any variance. The whitened sum leaves out pixels of variance 0. Pixels that
@@ -60,6 +65,7 @@ def combine(
     *,
     window: int = 15,
     whiten: bool = False,
+    divergence: Image | None = None,
 ) -> Image:
     """Shrink `unbiased` towards `biased` by the positive-part James-Stein rule.
 
@@ -79,6 +85,10 @@ def combine(
             window; with it, v_i of each pixel.
         window: width of the windows in pixels, odd, at least three.
         whiten: allow each pixel its own variance within a window.
+        divergence: D, how much of the variance y has in common with x, squared
+            radiance, shape [H,W,C]: `numerics.sure.monte_carlo_sure(...).divergence`
+            of the denoiser that made y, with this variance. None: y does not depend on
+            x.
 
     Returns:
         the combined rendering, linear radiance, shape [H,W,C]; at an invalid pixel
@@ -93,11 +103,14 @@ def combine(
         >>> print(combine(x, y, jnp.ones_like(x), window=3)[0, 0].round(3))
         [2.674]
 
-    Source: NJS eq. 5, 7, 13; the whitened form is ours.
+    Source: NJS eq. 5, 7, 13; the whitened form and the correction are ours.
     """
     valid, x, y, v = _prepare(unbiased, biased, variance, window)
-    difference = x - y
-    share = (_whitened_share if whiten else _share)(difference, v, valid, window)
+    if divergence is not None:
+        check_same_shape(unbiased=unbiased, divergence=divergence)
+        divergence = jnp.where(valid & finite(divergence), divergence, 0.0)
+    share_of = _whitened_share if whiten else _share
+    share = share_of(x - y, v, divergence, valid, window)
     share = window_mean(share, window, mask=valid)
     # As a blend, not y + share (x - y), so that shares of 0 and 1 are exact.
     blend = share * x + (1 - share) * y
@@ -259,13 +272,27 @@ def _prepare(
     return valid, x, y, v
 
 
-def _share(difference: Image, s2: Variance, valid: Mask, window: int) -> Image:
+def _share(
+    difference: Image,
+    s2: Variance,
+    divergence: Image | None,
+    valid: Mask,
+    window: int,
+) -> Image:
     """eta_c for one variance a window."""
     energy, count = _sum_and_count(jnp.square(difference), valid, window)
-    return _positive_part(_borrowed(count) * s2, energy)
+    if divergence is None:
+        return _positive_part(_borrowed(count) * s2, energy)
+    return _positive_part(count * s2 - window_sum(divergence, window), energy)
 
 
-def _whitened_share(difference: Image, v: Variance, valid: Mask, window: int) -> Image:
+def _whitened_share(
+    difference: Image,
+    v: Variance,
+    divergence: Image | None,
+    valid: Mask,
+    window: int,
+) -> Image:
     """eta_c with each pixel measured in units of its own variance."""
     square = jnp.square(difference)
     # A sample variance of exactly 0 tells of samples that all missed the light, not of
@@ -275,7 +302,10 @@ def _whitened_share(difference: Image, v: Variance, valid: Mask, window: int) ->
     evidence = divide(square, v, where=v * most > square, otherwise=most)
     evidence = jnp.where(counted, evidence, 0.0)
     energy, count = _sum_and_count(evidence, counted, window)
-    return _positive_part(_borrowed(count), energy)
+    if divergence is None:
+        return _positive_part(_borrowed(count), energy)
+    in_common = divide(divergence, v, where=counted & (v * most > jnp.abs(divergence)))
+    return _positive_part(count - window_sum(in_common, window), energy)
 
 
 def _sum_and_count(
@@ -293,5 +323,6 @@ def _borrowed(count: Image) -> Image:
 
 def _positive_part(noise: Image, energy: Image) -> Image:
     """(1 - noise / energy)+, and 1 where there is no noise to remove."""
+    noise = jnp.maximum(noise, 0.0)
     all_lost = jnp.where(noise > 0, 1.0, jnp.zeros_like(noise))
     return 1 - divide(noise, energy, where=energy > noise, otherwise=all_lost)

@@ -5,6 +5,7 @@ from jscomb.numerics import cholesky as cholesky
 from jscomb.numerics import guards as guards
 from jscomb.numerics import regression as regression
 from jscomb.numerics import simplex as simplex
+from jscomb.numerics import sure as sure
 from jscomb.numerics import tiles as tiles
 from jscomb.numerics import weights as weights
 from jscomb.numerics import windows as windows

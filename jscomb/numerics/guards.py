@@ -7,6 +7,8 @@ Images are `[H, W, C]`; a pixel is invalid with all its channels.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jscomb.typing import Image, Mask
@@ -34,6 +36,26 @@ def check_same_shape(**images: Float[Array, "..."]) -> None:
             raise ValueError(
                 f"{name} has shape {other.shape}, {first} has {image.shape}"
             )
+
+
+def check_not_negative(**images: Float[Array, "..."]) -> None:
+    """Raise if a value is negative; while tracing nothing is known, nothing raised.
+
+    Args:
+        images: the arrays by the names that the caller's user knows.
+
+    Returns:
+        nothing.
+
+    Raises:
+        ValueError: names the array and its least value.
+    """
+    for name, image in images.items():
+        if isinstance(image, Tracer):
+            continue
+        least = np.nanmin(np.asarray(image), initial=0.0)  # jnp would be traced
+        if least < 0:
+            raise ValueError(f"{name} must be at least zero, its least is {least}")
 
 
 def finite(*images: Float[Array, "h w _"]) -> Mask:

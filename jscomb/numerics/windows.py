@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jscomb.numerics.guards import divide
 from jscomb.typing import Image, Mask
@@ -85,7 +85,8 @@ def window_mean(
     if sigma is None:
         total, weight = window_sum(image, window), window_sum(ones, window)
     else:
-        total, weight = (_gaussian_sum(i, window, sigma) for i in (image, ones))
+        kernel = _gaussian(window, sigma)
+        total, weight = (separable_sum(i, kernel) for i in (image, ones))
     weight = jnp.broadcast_to(weight, total.shape)
     return divide(total, weight, where=weight > 0)
 
@@ -133,6 +134,69 @@ def window_max(image: Image, window: int, *, mask: Mask | None = None) -> Image:
         [[1. 2. 3. 3.]]
     """
     return _extremum(_only(image, mask, -np.inf), window, lax.max, -np.inf)
+
+
+def at_window_max(
+    by: Float[Array, "h w 1"], image: Image, window: int, *, mask: Mask | None = None
+) -> Image:
+    """Values of an image at the pixel of each window where another is greatest.
+
+    Args:
+        by: what is greatest there, finite, shape [H,W,1].
+        image: values of any unit, shape [H,W,C].
+        window: width w of the window in pixels, odd.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+
+    Returns:
+        the values, of one pixel for all channels, shape [H,W,C]; 0 where no pixel of
+        the window takes part.
+
+    Raises:
+        ValueError: if `window` is even or less than one.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> size = jnp.array([3.0, 1.0, 2.0, 0.0]).reshape(1, 4, 1)
+        >>> print(at_window_max(size, -size, 3)[..., 0])
+        [[-3. -3. -2. -2.]]
+    """
+
+    def pick(near: Image, far: Image) -> Image:
+        return jnp.where(near[..., :1] >= far[..., :1], near, far)
+
+    both = jnp.concatenate([_only(by, mask, -np.inf), _only(image, mask, 0.0)], axis=-1)
+    best = _extremum(both, window, pick, -np.inf)
+    return jnp.where(best[..., :1] > -np.inf, best[..., 1:], 0.0)
+
+
+def separable_sum(
+    image: Image, kernel: Float[ArrayLike, " taps"], *, mask: Mask | None = None
+) -> Image:
+    """Sum over the window with weights kernel[row] * kernel[column].
+
+    Args:
+        image: values of any unit, shape [H,W,C].
+        kernel: weights along either axis, an odd number of them.
+        mask: pixels that take part, shape [H,W,1]; None for all.
+
+    Returns:
+        the sums, in the unit of `image`, shape [H,W,C].
+
+    Raises:
+        ValueError: if the kernel's length is even.
+    """
+    kernel = jnp.asarray(kernel, image.dtype)
+    r = check_window(len(kernel)) // 2
+    image = _only(image, mask, 0.0)
+    for axis in (1, 0):
+        size = image.shape[axis]
+        ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
+        padded = jnp.pad(image, ends)
+        image = sum(
+            weight * lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k, weight in enumerate(kernel)
+        )  # type: ignore[assignment]
+    return image
 
 
 def window_count(
@@ -278,19 +342,10 @@ def _extremum(image: Image, window: int, pick: Callable, neutral: float) -> Imag
     return image
 
 
-def _gaussian_sum(image: Image, window: int, sigma: float) -> Image:
-    """Sum over the window with Gaussian weights of total one where none is clipped."""
+def _gaussian(window: int, sigma: float) -> np.ndarray:
+    """Gaussian weights along one axis, of total one."""
     r = check_window(window) // 2
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
     weights = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
-    weights = (weights / weights.sum()).astype(image.dtype)
-    for axis in (1, 0):
-        size = image.shape[axis]
-        ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
-        padded = jnp.pad(image, ends)
-        image = sum(
-            weight * lax.slice_in_dim(padded, k, k + size, axis=axis)
-            for k, weight in enumerate(weights)
-        )  # type: ignore[assignment]
-    return image
+    return weights / weights.sum()

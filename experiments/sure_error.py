@@ -1,0 +1,261 @@
+"""Does SURE know a denoised image's error, and what is that knowledge good for?
+
+    python -m experiments.sure_error FOLDER --results FILE.json
+
+Three tables:
+
+    digits   divergence of the joint bilateral filter on a real frame in float32, by one
+             forward derivative and by differences of many steps, against the derivative
+             in float64: relative L1.
+    probes   what 1, 2, 4 and 8 probes cost and bring: time divided by that of denoising
+             alone, and the standard error over probes of the mean SURE of 31x31
+             windows, relative to it; by the derivative, and by differences of 1e-4.
+    frames   every archive in the folder (see `frames`): the error of Open Image Denoise
+             as SURE estimates it and as it is, both relative to the denoised radiance
+             squared (plus 0.01); and relative L2, less the reference's noise, of
+             progressive mixing and of James-Stein, without and with the divergence.
+"""
+
+import dataclasses
+import functools
+import json
+import pathlib
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments import frames
+from experiments.timing import medians
+from jscomb import james_stein, progressive
+from jscomb.denoisers import bilateral, oidn
+from jscomb.features import stack
+from jscomb.frame import Frame
+from jscomb.metrics import rel_l2
+from jscomb.numerics import sure
+from jscomb.typing import Image
+
+STEPS = [10.0**k for k in range(-6, 1)]
+PROBES = 1, 2, 4, 8
+WINDOW, KEYS = 31, 8
+PAPERS_STEP = 1e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to measure.
+
+    Attributes:
+        folder: of NumPy archives.
+        results: file that the frames' results are kept in; None to keep none.
+        frame: which archive the first two tables are about.
+        samples: its samples a pixel.
+        repeats: timed calls of each function.
+        quick: only the first archive, at its least sample count, and few probes.
+    """
+
+    folder: tyro.conf.Positional[pathlib.Path]
+    results: pathlib.Path | None = None
+    frame: str = "cbox-glass"
+    samples: int = 64
+    repeats: int = 3
+    quick: bool = False
+
+
+def oidn_of(frame: Frame) -> Callable[[Image], Image]:
+    """Open Image Denoise with the frame's features and exposure."""
+    return lambda x: oidn.denoise(
+        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.exposure
+    )
+
+
+def bilateral_of(frame: Frame) -> Callable[[Image], Image]:
+    """The joint bilateral filter with the frame's features and variance."""
+    features = stack(frame)
+    return lambda x: bilateral.denoise(
+        x, frame.variance.astype(x.dtype), features.astype(x.dtype)
+    )
+
+
+def by_difference(
+    key: jax.Array, denoise: Callable, x: Image, v: Image, *, step: float, probes: int
+) -> Image:
+    """SURE of each element by forward differences, as the papers have it."""
+    y, total = denoise(x), jnp.zeros_like(x)
+    for one in jax.random.split(key, probes):
+        b = jnp.sqrt(v) * jax.random.rademacher(one, x.shape, x.dtype)
+        total = total + b * (denoise(x + step * b) - y) / step
+    return jnp.square(y - x) + 2 * total / probes - v
+
+
+def digits(frame: Frame) -> dict[str, float]:
+    """Relative error of the divergence in float32."""
+    key, x, v = jax.random.key(0), frame.color, frame.variance
+    b = jnp.sqrt(v) * jax.random.rademacher(key, x.shape, x.dtype)
+    with jax.enable_x64(True):
+        wide = (
+            jnp.asarray(np.asarray(x), jnp.float64),
+            jnp.asarray(np.asarray(b), jnp.float64),
+        )
+        derivative = jax.jit(lambda x, b: jax.jvp(bilateral_of(frame), (x,), (b,))[1])
+        truth = np.asarray(derivative(*wide) * wide[1])
+    denoise = jax.jit(bilateral_of(frame))
+    found = {"jvp": b * jax.jit(derivative)(x, b)}
+    for step in STEPS:
+        found[f"{step:.0e}"] = b * (denoise(x + step * b) - denoise(x)) / step
+    return {
+        name: float(abs(np.asarray(each) - truth).sum() / abs(truth).sum())
+        for name, each in found.items()
+    }
+
+
+def probes(frame: Frame, counts: tuple[int, ...], repeats: int) -> list[dict]:
+    """Time and standard error of SURE for both denoisers, by both ways."""
+    x, v = frame.color, frame.variance
+    rows = []
+    for name, denoise in (("bilateral", bilateral_of(frame)), ("oidn", oidn_of(frame))):
+        plain = medians({"": functools.partial(jax.jit(denoise), x)}, repeats)[""]
+        for count in counts:
+            ways = {
+                "jvp": lambda key, d=denoise, n=count: (
+                    sure.monte_carlo_sure(key, d, x, v, probes=n).squared_error
+                ),
+                "difference": lambda key, d=denoise, n=count: by_difference(
+                    key, d, x, v, step=PAPERS_STEP, probes=n
+                ),
+            }
+            for way, estimate in ways.items():
+                call = jax.jit(estimate)
+                seconds = medians({"": lambda c=call: c(jax.random.key(0))}, repeats)[
+                    ""
+                ]
+                keys = jax.random.split(jax.random.key(1), KEYS)
+                zero = jnp.zeros_like(v)
+                means = [
+                    sure.pooled(sure.Risk(x, call(k), zero), x, v, window=WINDOW)
+                    for k in keys
+                ]
+                each = np.stack([m.squared_error for m in means])
+                spread = each.std(axis=0, ddof=1).mean() / abs(each.mean(axis=0)).mean()
+                rows.append(
+                    {
+                        "denoiser": name,
+                        "by": way,
+                        "probes": count,
+                        "time / denoising": seconds / plain,
+                        "standard error": float(spread),
+                    }
+                )
+    return rows
+
+
+def measure(frame: Frame) -> dict[str, float]:
+    """Errors of one frame, estimated and true."""
+    assert frame.reference is not None
+    r, noise = frame.reference
+    x, v = frame.color, frame.variance
+    error = lambda image: float(rel_l2(image, r, half_difference=noise))
+    denoise = jax.jit(oidn_of(frame))
+    estimate = functools.partial(sure.monte_carlo_sure, jax.random.key(0), denoise, x)
+    risk = estimate(v)
+    y, s = risk.denoised, risk.squared_error
+    weight = 1 / (jnp.square(jnp.mean(y, axis=-1, keepdims=True)) + 0.01)
+    truth = jnp.square(y - r) - jnp.square(noise) / 4
+    row = {
+        "estimated": float(jnp.mean(weight * s)),
+        "true": float(jnp.mean(weight * truth)),
+        "path tracing": error(x),
+        "oidn": error(y),
+    }
+    for window in (15, 31, 63):
+        alpha = progressive.mixing(x, y, v, s, window=window)
+        bound = progressive.bound_mixing(alpha, x, y, v)
+        row[f"progressive {window}x{window}"] = error(x + alpha * (y - x))
+        row[f"progressive {window}x{window}, bounded"] = error(x + bound * (y - x))
+    bound = progressive.bound_mixing(jnp.ones_like(x), x, y, v)
+    row["oidn, bounded"] = error(x + bound * (y - x))
+    smooth, robust = james_stein.smooth_variance(v), james_stein.robust_variance(v)
+    for name, variance, options in (
+        ("james-stein", smooth, {}),
+        ("james-stein whitened", robust, {"whiten": True, "window": 7}),
+        ("james-stein whitened 15x15", robust, {"whiten": True}),
+    ):
+        run = functools.partial(james_stein.combine, x, y, variance, **options)
+        row[name] = error(run())
+        row[f"{name}, corrected"] = error(run(divergence=estimate(variance).divergence))
+    return row
+
+
+def run(config: Config) -> dict:
+    """Measure everything.
+
+    Args:
+        config: what to measure.
+
+    Returns:
+        `digits`: relative error by way; `probes`: a row for each denoiser, way and
+        number; `frames`: errors by "frame samples".
+
+    Raises:
+        ValueError: if the folder holds no archive.
+    """
+    cases = frames.cases(config.folder, quick=config.quick)
+    path, samples = config.folder / f"{config.frame}.npz", config.samples
+    if config.quick:
+        path, samples = cases[0]
+    frame = frames.load(path, samples)
+    frame = frame.scaled(1 / frame.exposure)
+    found: dict[str, dict[str, float]] = {}
+    if config.results is not None and config.results.exists():
+        found = json.loads(config.results.read_text())
+    for path, samples in tqdm(cases, unit="frame"):
+        name = f"{path.stem} {samples}"
+        if name in found:
+            continue
+        one = frames.load(path, samples)
+        found[name] = measure(one.scaled(1 / one.exposure))
+        if config.results is not None:
+            config.results.write_text(json.dumps(found, indent=1))
+    counts, repeats = (PROBES[:1], 1) if config.quick else (PROBES, config.repeats)
+    return {
+        "digits": digits(frame),
+        "probes": probes(frame, counts, repeats),
+        "frames": found,
+    }
+
+
+def main() -> None:
+    """Print the tables."""
+    found = run(tyro.cli(Config, description=__doc__))
+    print("| step | relative error |\n| --- | --- |")
+    for name, each in found["digits"].items():
+        print(f"| {name} | {each:.1e} |")
+    columns = list(found["probes"][0])
+    print("\n|", " | ".join(columns), "|\n" + "| --- " * len(columns) + "|")
+    for row in found["probes"]:
+        cells = (f"{c:.3g}" if isinstance(c, float) else str(c) for c in row.values())
+        print("|", " | ".join(cells), "|")
+    rows = found["frames"]
+    columns = list(next(iter(rows.values())))
+    print(
+        "\n| frame |", " | ".join(columns), "|\n" + "| --- " * (len(columns) + 1) + "|"
+    )
+    for name, row in rows.items():
+        print(f"| {name} |", " | ".join(f"{row[c]:.5f}" for c in columns), "|")
+    counts = sorted({int(name.split()[-1]) for name in rows})
+    print("\n| error / oidn |", " | ".join(map(str, counts)), "| worst |")
+    print("| --- " * (len(counts) + 2) + "|")
+    for method in columns[4:]:
+        ratios = {
+            c: [r[method] / r["oidn"] for n, r in rows.items() if n.endswith(f" {c}")]
+            for c in counts
+        }
+        means = " | ".join(f"{np.exp(np.mean(np.log(r))):.3f}" for r in ratios.values())
+        print(f"| {method} | {means} | {max(map(max, ratios.values())):.2f} |")
+
+
+if __name__ == "__main__":
+    main()

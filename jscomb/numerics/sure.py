@@ -1,0 +1,197 @@
+r"""Stein's unbiased risk estimate: a denoised image's squared error, without truth.
+
+Layout: images [H,W,C], linear radiance. Notation, for each element i of an image:
+
+    x    noisy, unbiased image; truth mu; x ~ N(mu, v), elements independent
+    v    variance of the mean x
+    F    denoiser, any function of an image; J its Jacobian at x
+    b    probe, independent elements of mean 0 and variance v
+
+    E[(F(x) - mu)_i^2] = E[(F(x) - x)_i^2 + 2 J_ii v_i - v_i]                  (SURE)
+    J_ii v_i = E[b_i (J b)_i]                                           (Monte Carlo)
+
+J b is one forward derivative: exact, whatever the scale of x, where a difference
+quotient of float32 images has lost its digits on bright pixels or its slope on dark
+ones. One element's estimate is hardly more than noise and often negative: average over
+windows or frames. What the noise's tails and correlations do to the truth of it, the
+formula does not know.
+
+Sources:
+    C. Stein, "Estimation of the mean of a multivariate normal distribution", 1981.
+    S. Ramani, T. Blu, M. Unser, "Monte-Carlo SURE", 2008.
+    A. Firmino, J. Frisvad, H. Jensen, "Progressive Denoising of Monte Carlo Rendered
+    Images", 2022 (PD eq. 1, 2).
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jscomb.numerics.guards import check_not_negative, check_same_shape, finite
+from jscomb.numerics.windows import window_mean
+from jscomb.typing import Image, Key, Variance
+
+Probe = Literal["rademacher", "gaussian"]
+
+
+class Risk(NamedTuple):
+    """A denoised image and what is known of its error, [H,W,C] each.
+
+    Attributes:
+        denoised: F(x), linear radiance.
+        squared_error: estimate of (F(x) - mu)^2 at each element, squared radiance;
+            unbiased, noisy, of either sign; 0 at invalid pixels.
+        divergence: estimate of J_ii v_i, squared radiance; 0 at invalid pixels.
+    """
+
+    denoised: Image
+    squared_error: Image
+    divergence: Image
+
+
+def monte_carlo_sure(
+    key: Key,
+    denoise: Callable[[Image], Image],
+    noisy: Image,
+    variance: Variance,
+    *,
+    probes: int = 1,
+    probe: Probe = "rademacher",
+) -> Risk:
+    """Denoise, and estimate the squared error of every element of the result.
+
+    One forward derivative a probe, one probe at a time: neither time but that of
+    denoising nor memory but that of a probe. Scale-equivariant if the denoiser is.
+
+    Args:
+        key: of the probes, a typed key.
+        denoise: F, from an image to one of the same shape; with forward derivatives.
+            Features that guide it count as fixed.
+        noisy: x, linear radiance, shape [H,W,C].
+        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        probes: how many to average over; the divergence's own noise falls with them,
+            that of (F(x) - x)^2 does not.
+        probe: signs ("rademacher": exact with a single probe where each output depends
+            on its own pixel alone, and the better one in general), or "gaussian".
+
+    Returns:
+        the denoised image, its estimated squared error, and the divergence. Pixels that
+        are not finite in x or v are not probed.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, the denoiser changes the shape,
+            `probes` is not positive or the probe is not known; and if the variance is
+            negative, where its values are known.
+
+    Example:
+        >>> x = jnp.full((4, 4, 1), 3.0)
+        >>> half = lambda image: image / 2
+        >>> risk = monte_carlo_sure(jax.random.key(0), half, x, jnp.ones_like(x))
+        >>> print(f"{risk.squared_error.mean():.3f} {risk.divergence.mean():.3f}")
+        2.250 0.500
+
+    Source: PD eq. 1, 2, with the exact derivative.
+    """
+    if probes < 1:
+        raise ValueError(f"probes must be positive, got {probes}")
+    if probe not in get_args(Probe):
+        raise ValueError(f"probe must be one of {get_args(Probe)}, got {probe!r}")
+    deviation = _deviation(noisy, variance)
+    draw = jax.random.rademacher if probe == "rademacher" else jax.random.normal
+
+    def one(key: Array) -> tuple[Image, Image]:
+        """F(x), and what a single probe says of the divergence."""
+        b = deviation * draw(key, noisy.shape, noisy.dtype)
+        denoised, moved = jax.jvp(denoise, (noisy,), (b,))
+        _check_denoised(denoised, noisy)
+        return denoised, b * moved
+
+    first, others = jax.random.split(key)
+    denoised, total = one(first)
+    if probes > 1:
+        add = lambda total, key: (total + one(key)[1], None)
+        total, _ = lax.scan(add, total, jax.random.split(others, probes - 1))
+    return _risk(noisy, variance, denoised, total / probes)
+
+
+def exact_sure(
+    denoise: Callable[[Image], Image], noisy: Image, variance: Variance
+) -> Risk:
+    """The same with the exact divergence: a derivative for every element.
+
+    For checking on small images.
+
+    Args:
+        denoise: F, from an image to one of the same shape; with forward derivatives.
+        noisy: x, linear radiance, shape [H,W,C].
+        variance: v, squared radiance, shape [H,W,C].
+
+    Returns:
+        as `monte_carlo_sure`.
+
+    Raises:
+        ValueError: as `monte_carlo_sure`.
+    """
+    deviation = _deviation(noisy, variance).ravel()
+    denoised, push = jax.linearize(denoise, noisy)
+    _check_denoised(denoised, noisy)
+
+    def one(place: Array) -> Array:
+        """J_ii v_i of one element."""
+        b = jnp.where(jnp.arange(noisy.size) == place, deviation, 0.0)
+        return deviation[place] * push(b.reshape(noisy.shape)).ravel()[place]
+
+    divergence = lax.map(one, jnp.arange(noisy.size)).reshape(noisy.shape)
+    return _risk(noisy, variance, denoised, divergence)
+
+
+def pooled(risk: Risk, noisy: Image, variance: Variance, *, window: int) -> Risk:
+    """Means over windows of the estimates, which is what makes them usable.
+
+    Args:
+        risk: of `monte_carlo_sure`.
+        noisy: x that it was made from, shape [H,W,C].
+        variance: v likewise.
+        window: width of the windows in pixels, odd.
+
+    Returns:
+        the same with `squared_error` and `divergence` averaged over the valid pixels of
+        each window.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+    """
+    check_same_shape(noisy=noisy, variance=variance, denoised=risk.denoised)
+    valid = finite(noisy, variance)
+    mean = lambda image: window_mean(image, window, mask=valid)
+    return Risk(risk.denoised, mean(risk.squared_error), mean(risk.divergence))
+
+
+def _deviation(noisy: Image, variance: Variance) -> Image:
+    """Standard deviation of valid pixels, else 0; with a derivative at 0, of 0."""
+    check_same_shape(noisy=noisy, variance=variance)
+    check_not_negative(variance=variance)
+    some = finite(noisy, variance) & (variance > 0)
+    return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1.0)), 0.0)
+
+
+def _risk(noisy: Image, variance: Variance, denoised: Image, divergence: Image) -> Risk:
+    """SURE of every element."""
+    valid = finite(noisy, variance, denoised)
+    x, v, y, d = (
+        jnp.where(valid, i, 0.0) for i in (noisy, variance, denoised, divergence)
+    )
+    return Risk(denoised, jnp.square(y - x) + 2 * d - v, d)
+
+
+def _check_denoised(denoised: Array, noisy: Image) -> None:
+    """Raise unless the denoiser kept the shape."""
+    if denoised.shape != noisy.shape:
+        raise ValueError(
+            f"denoise made {denoised.shape} of an image of {noisy.shape}: it must keep "
+            "the shape"
+        )

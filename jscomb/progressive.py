@@ -1,0 +1,252 @@
+r"""Progressive denoising: mix a rendering with its denoised image, consistently.
+
+Layout: images [H,W,C], linear radiance; channels are mixed separately. Notation:
+
+    x      unbiased rendering (path traced), y its denoised image
+    v      variance of the mean x at each pixel, squared radiance
+    s      SURE, the estimated squared error of y, see `numerics.sure`; of either sign
+    alpha  mixing, in [0, 1]: the result is z = x + alpha (y - x)
+    beta   1 - alpha
+
+The least expected error of z, with D the divergence of the denoiser times v, is at
+
+    alpha = (v - D) / (y - x)^2,    beta = (s - D) / (y - x)^2                   (9, 10)
+
+and D = (s - (y - x)^2 + v) / 2 by what SURE is, so that both are the same choice,
+
+    alpha = (v - s + (y - x)^2) / (2 (y - x)^2).
+
+In one pixel that is noise; numerator and denominator are summed over a window. (With
+the sum it is James-Stein's rule for a y that depends on x.)
+
+The bound takes alpha back where a weighted mean of z over a neighbourhood is farther
+from that of x than the noise explains. As samples grow v falls, and wherever y is
+biased alpha goes to zero: z is consistent whatever y is.
+
+Source: A. Firmino, J. Frisvad, H. Jensen, "Progressive Denoising of Monte Carlo
+Rendered Images", 2022 (PD; eq. numbers below).
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Float
+
+from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.numerics.windows import (
+    at_window_max,
+    check_window,
+    separable_sum,
+    window_sum,
+)
+from jscomb.typing import Image, Variance
+
+Mixing = Callable[[Image, Image, Variance, Image], Image]
+
+_NARROWEST, _WIDEST = 1e-3, 100.0  # of the bound's Gaussian, in pixels
+
+
+def combine(
+    unbiased: Image,
+    biased: Image,
+    variance: Variance,
+    sure: Image,
+    *,
+    mix: Mixing | None = None,
+    bound: bool = True,
+) -> Image:
+    """Mix a rendering and its denoised image.
+
+    Pure, scale-equivariant, and differentiable in every array.
+
+    Args:
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, the denoised x, linear radiance, shape [H,W,C].
+        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        sure: s, `numerics.sure.monte_carlo_sure(...).squared_error`, squared radiance,
+            shape [H,W,C].
+        mix: from these four arrays to alpha in [0, 1]: `mixing`, which is taken for
+            None, or a network.
+        bound: take alpha back where it is not consistent with the noise.
+
+    Returns:
+        z, linear radiance, shape [H,W,C]; at an invalid pixel the first finite of
+        (y, x), else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Source: PD eq. 11, 18.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
+    alpha = (mix or mixing)(unbiased, biased, variance, sure)
+    if bound:
+        alpha = bound_mixing(alpha, unbiased, biased, variance)
+    valid = finite(unbiased, biased, variance, sure)
+    x, y = (jnp.where(valid, image, 0.0) for image in (unbiased, biased))
+    # As a blend, not x + alpha (y - x), so that 0 and 1 are exact.
+    blend = (1 - alpha) * x + alpha * y
+    return jnp.where(valid, blend, first_finite(biased, unbiased))
+
+
+def mixing(
+    unbiased: Image,
+    biased: Image,
+    variance: Variance,
+    sure: Image,
+    *,
+    window: int = 31,
+) -> Image:
+    """Mixing of least estimated error over windows, without a network.
+
+    Args:
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, linear radiance, shape [H,W,C].
+        variance: v, squared radiance, at least zero, shape [H,W,C].
+        sure: s, squared radiance, of either sign, shape [H,W,C].
+        window: width of the windows in pixels, odd.
+
+    Returns:
+        alpha, in [0, 1], shape [H,W,C]; 1 where x and y are the same all over the
+        window.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+
+    Source: PD eq. 9, 10, summed over windows and channels alike.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
+    valid = finite(unbiased, biased, variance, sure)
+    images = unbiased, biased, variance, sure
+    x, y, v, s = (jnp.where(valid, image, 0.0) for image in images)
+    square = window_sum(jnp.square(y - x), window)
+    gain = window_sum(v - s, window) + square  # what SURE says that y saves
+    some = square > 0
+    ratio = divide(gain, 2 * square, where=some, otherwise=1.0)
+    return jnp.clip(ratio, 0.0, 1.0)
+
+
+def risk(
+    mixing: Image, unbiased: Image, biased: Image, variance: Variance, sure: Image
+) -> Image:
+    """Estimate the squared error of the mixed image.
+
+    For a mixing that does not follow the noise; one that does is better on paper than
+    in truth.
+
+    Args:
+        mixing: alpha, in [0, 1], shape [H,W,C].
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, linear radiance, shape [H,W,C].
+        variance: v, squared radiance, at least zero, shape [H,W,C].
+        sure: s, squared radiance, of either sign, shape [H,W,C].
+
+    Returns:
+        the estimate at each element, squared radiance, noisy, of either sign, shape
+        [H,W,C]; average before use. 0 at invalid pixels.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Source: PD eq. 8.
+    """
+    check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased)
+    check_same_shape(mixing=mixing, variance=variance, sure=sure)
+    images = mixing, unbiased, biased, variance, sure
+    valid = finite(*images)
+    alpha, x, y, v, s = (jnp.where(valid, image, 0.0) for image in images)
+    divergence = (s - jnp.square(y - x) + v) / 2
+    beta = 1 - alpha
+    return beta**2 * v + alpha**2 * s + 2 * alpha * beta * divergence
+
+
+def activation(outputs: Float[Array, "h w 3 c"]) -> Image:
+    """Alpha from what a network puts out, in the form of eq. 9.
+
+    Args:
+        outputs: xi_1, xi_2, xi_3 of each channel, shape [H,W,3,C].
+
+    Returns:
+        clip((xi_1 - xi_2) / max(xi_3, 1e-6), 0, 1), shape [H,W,C].
+
+    Source: PD eq. 19.
+    """
+    first, second, third = (outputs[:, :, k] for k in range(3))
+    return jnp.clip((first - second) / jnp.maximum(third, 1e-6), 0.0, 1.0)
+
+
+def bound_mixing(
+    mixing: Image,
+    unbiased: Image,
+    biased: Image,
+    variance: Variance,
+    *,
+    window: int = 11,
+    strength: float = 2.0,
+    shift: float = 4.2,
+) -> Image:
+    """Lower the mixing where it moves the image by more than noise explains.
+
+    A t-statistic of means over the channels and over a neighbourhood: the pixel of
+    largest variance in the window, and the window with Gaussian weights, the narrower
+    the less noise there is.
+
+    Args:
+        mixing: alpha, in [0, 1], shape [H,W,C].
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, linear radiance, shape [H,W,C].
+        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        window: width of the windows in pixels, odd.
+        strength: a, how soon the bound sets in.
+        shift: c, at how many standard deviations.
+
+    Returns:
+        alpha' = alpha (1 - Phi(a (|t| - c))), shape [H,W,C]; 0 where x is certain and
+        would be moved, and at invalid pixels.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+
+    Source: PD eq. 12-18. The width of the Gaussian there is absolute; here it is
+    relative to the mean radiance, which is the same at an exposure of about one.
+    """
+    check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased, variance=variance)
+    images = mixing, unbiased, biased, variance
+    valid = finite(*images)
+    alpha, x, y, v = (jnp.where(valid, image, 0.0) for image in images)
+    channels = x.shape[-1]
+    moved = jnp.mean(alpha * (y - x), axis=-1, keepdims=True)
+    noise = jnp.sum(v, axis=-1, keepdims=True) / channels**2
+    largest = at_window_max(
+        noise, jnp.concatenate([moved, noise], axis=-1), window, mask=valid
+    )
+    count = jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
+    radiance = jnp.sum(jnp.abs(x)) / (count * channels)
+    kernel = _kernel(jnp.sum(noise) / count, radiance, window)
+    mean = largest[..., :1] + separable_sum(moved, kernel)
+    error = largest[..., 1:] + separable_sum(noise, jnp.square(kernel))
+    t = _magnitude(mean, error)
+    return jnp.where(valid, alpha * ndtr(strength * (shift - t)), 0.0)
+
+
+def _kernel(noise: Array, radiance: Array, window: int) -> Float[Array, " taps"]:
+    """Along one axis: rows times columns are the weights of eq. 15."""
+    square = divide(noise, jnp.square(radiance), where=radiance > 0)
+    some = square > 0
+    relative = jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+    sigma = jnp.clip(_WIDEST * relative, _NARROWEST, _WIDEST)
+    r = check_window(window) // 2
+    offsets = jnp.arange(-r, r + 1, dtype=noise.dtype)
+    shape = jnp.exp(-jnp.square(offsets / sigma) / 2)
+    return shape / jnp.sqrt(sigma * (2 * jnp.pi) ** 0.5)
+
+
+def _magnitude(mean: Array, error: Array) -> Array:
+    """|t| = |mean| / sqrt(error); beyond any bound where there is no error."""
+    square = jnp.square(mean)
+    least = jnp.finfo(mean.dtype).eps * square
+    certain = jnp.where(square > 0, 1e6, jnp.zeros_like(square))
+    ratio = divide(square, error, where=error > least, otherwise=certain)
+    some = ratio > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, ratio, 1.0)), 0.0)

@@ -1,0 +1,173 @@
+"""Progressive denoising: mixing, activation, bound."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.special import ndtr
+from jax.test_util import check_grads
+
+from jscomb import progressive
+from jscomb.denoisers import smoothing
+from jscomb.numerics import sure
+from tests.statistics import assert_mean, assert_mean_below
+
+RNG = np.random.default_rng(6)
+SHAPE = 12, 13, 3
+X, Y = (jnp.asarray(i) for i in RNG.uniform(0.5, 1.5, (2, *SHAPE)))
+V = jnp.asarray(RNG.uniform(0.001, 0.01, SHAPE))
+S = jnp.asarray(RNG.normal(0, 0.2, SHAPE))
+combine = jax.jit(progressive.combine, static_argnames=("mix", "bound"))
+bound_mixing = jax.jit(progressive.bound_mixing, static_argnames="window")
+
+
+def test_both_equations_are_one_choice():
+    """Eq. 9 of the window, and one minus eq. 10, with D from SURE."""
+    square = (Y - X) ** 2
+    divergence = (S - square + V) / 2
+    around = lambda image: smoothing.box(image, window=5)  # means, whose ratios count
+    alpha = around(V - divergence) / around(square)
+    beta = around(S - divergence) / around(square)
+    np.testing.assert_allclose(alpha + beta, 1, rtol=1e-10)
+    found = progressive.mixing(X, Y, V, S, window=5)
+    np.testing.assert_allclose(found, jnp.clip(alpha, 0, 1), atol=1e-12)
+    assert 0 < float(jnp.mean((found > 0) & (found < 1))) < 1
+
+
+def test_mixing_has_the_least_risk():
+    """With many realisations no constant mixture is better than the rule's."""
+    truth = jnp.asarray(1 + np.add.outer(np.arange(16), np.arange(16))[..., None] / 16)
+    noise = 0.15
+    blur = lambda x: smoothing.box(x, window=7)
+
+    @jax.jit
+    def one(key):
+        a, b = jax.random.split(key)
+        x = truth + noise * jax.random.normal(a, truth.shape, truth.dtype)
+        v = jnp.full_like(x, noise**2)
+        risk = sure.monte_carlo_sure(b, blur, x, v)
+        z = progressive.combine(x, risk.denoised, v, risk.squared_error, bound=False)
+        error = lambda image: jnp.mean((image - truth) ** 2)
+        return error(z), error(x), error(risk.denoised)
+
+    z, x, y = jax.lax.map(one, jax.random.split(jax.random.key(0), 400), batch_size=50)
+    assert_mean_below(z - x, 0)
+    assert_mean_below(z - y, 0)
+
+
+def test_risk_is_unbiased_for_a_fixed_mixing():
+    truth = jnp.asarray(1 + np.add.outer(np.arange(9), np.arange(9))[..., None] / 9)
+    alpha = jnp.asarray(RNG.uniform(size=truth.shape))
+    blur = lambda x: smoothing.box(x, window=3)
+
+    @jax.jit
+    def excess(key):
+        a, b = jax.random.split(key)
+        x = truth + 0.2 * jax.random.normal(a, truth.shape, truth.dtype)
+        v = jnp.full_like(x, 0.04)
+        y, s, _ = sure.monte_carlo_sure(b, blur, x, v)
+        z = x + alpha * (y - x)
+        estimate = progressive.risk(alpha, x, y, v, s)
+        return jnp.mean(estimate - (z - truth) ** 2)
+
+    keys = jax.random.split(jax.random.key(0), 5000)
+    assert_mean(jax.lax.map(excess, keys, batch_size=500), 0)
+
+
+def bound_by_loops(alpha, x, y, v, *, window, strength, shift):
+    """Eq. 12 to 18, every window by itself."""
+    height, width, channels = x.shape
+    z = (x + alpha * (y - x)).mean(-1)
+    noise, x = v.sum(-1) / channels**2, x.mean(-1)
+    relative = np.sqrt(noise.mean()) / abs(x).mean()
+    sigma = np.clip(100 * relative, 1e-3, 100)
+    out = np.zeros_like(np.asarray(alpha))
+    for place in np.ndindex(height, width):
+        near = [
+            q
+            for q in np.ndindex(height, width)
+            if max(abs(q[0] - place[0]), abs(q[1] - place[1])) <= window // 2
+        ]
+        largest = max(near, key=lambda q: noise[q])
+        x_bar, z_bar, variance = x[largest], z[largest], noise[largest]
+        for q in near:
+            square = (q[0] - place[0]) ** 2 + (q[1] - place[1]) ** 2
+            k = np.exp(-square / (2 * sigma**2)) / (sigma * np.sqrt(2 * np.pi))
+            x_bar, z_bar = x_bar + k * x[q], z_bar + k * z[q]
+            variance += k**2 * noise[q]
+        t = abs(z_bar - x_bar) / np.sqrt(variance)
+        out[place] = alpha[place] * float(ndtr(strength * (shift - t)))
+    return out
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-4, 1.0])
+def test_bound_is_the_loops(noise):
+    alpha = jnp.asarray(RNG.uniform(size=SHAPE))
+    y = X + np.sqrt(noise) * (Y - X)
+    options = {"window": 5, "strength": 2.0, "shift": 4.2}
+    expected = bound_by_loops(
+        *(np.asarray(i) for i in (alpha, X, y, noise * V)), **options
+    )
+    for dtype, tolerance in ((jnp.float64, 1e-9), (jnp.float32, 2e-3)):
+        arrays = [i.astype(dtype) for i in (alpha, X, y, noise * V)]
+        found = bound_mixing(*arrays, window=5)
+        np.testing.assert_allclose(found, expected, atol=tolerance)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.05])
+def test_the_bound_is_consistent(bias):
+    """As samples grow a biased denoiser loses its share, an unbiased one keeps it."""
+    shares = []
+    for variance in (1e-1, 1e-3, 1e-5, 1e-7):
+        noise = np.sqrt(variance) * RNG.normal(size=(2, 24, 24, 3))
+        x, y = (
+            1 + jnp.asarray(n) for n in noise * np.array([1, 0.1])[:, None, None, None]
+        )
+        v = jnp.full_like(x, variance)
+        shares.append(float(bound_mixing(jnp.ones_like(x), x, y + bias, v).mean()))
+    assert shares[0] > 0.95
+    if bias:
+        assert shares[-1] < 1e-6
+    else:
+        assert min(shares) > 0.95
+
+
+def test_activation():
+    outputs = jnp.asarray(RNG.normal(size=(3, 4, 3, 2)))
+    found = progressive.activation(outputs)
+    one, two, three = np.moveaxis(np.asarray(outputs), 2, 0)
+    expected = np.clip((one - two) / np.maximum(three, 1e-6), 0, 1)
+    np.testing.assert_allclose(found, expected)
+
+
+def test_a_network_may_mix():
+    half = lambda x, y, v, s: jnp.full_like(x, 0.5)
+    z = progressive.combine(X, Y, V, S, mix=half, bound=False)
+    np.testing.assert_allclose(z, (X + Y) / 2)
+
+
+def test_certain_pixels_are_kept():
+    """Without any variance the bound keeps x; where both agree nothing is moved."""
+    zero = jnp.zeros_like(X)
+    np.testing.assert_array_equal(combine(X, Y, zero, -jnp.ones_like(X)), X)
+    np.testing.assert_array_equal(combine(X, X, V, S), X)
+    total = lambda *i: progressive.combine(*i).sum()
+    for v, y in ((zero, Y), (V, X), (zero, X)):
+        for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(X, y, v, S):
+            assert np.isfinite(gradient).all()
+
+
+def test_gradients():
+    y = X + 0.2 * (Y - X)
+    small = lambda *images: [i[:6, :7] for i in images]
+    s = 0.2 * (y - X) ** 2  # so that mixing is strictly between its limits
+    run = lambda *i: progressive.combine(*i)
+    check_grads(jax.jit(run), small(X, y, V, s), 1, modes=["rev"], rtol=1e-4)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bad_input():
+    with pytest.raises(ValueError, match="sure has shape"):
+        progressive.combine(X, Y, V, S[1:])
+    with pytest.raises(ValueError, match="window must be odd"):
+        progressive.mixing(X, Y, V, S, window=4)
