@@ -35,9 +35,7 @@ COMBINERS = {
     "ensemble multi-scale": lambda x, y, v: ensemble_of(
         x, y, v, solver="multi-scale", windows=(7, 11)
     ),
-    "progressive": lambda x, y, v: progressive.combine(
-        x, y, v, jnp.square(y - x) - v / 2
-    ),
+    "progressive": lambda x, y, v: progressive.combine(x, y, v, v / 2),
     **{f"command, {name}": method for name, method in METHODS.items()},
 }
 

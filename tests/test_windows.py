@@ -65,6 +65,41 @@ def test_count_is_the_sum_of_ones(shape, window):
     )
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("window", [1, 5, 15])
+def test_values_at_the_largest_match_loops(shape, window):
+    image, by = images(shape), images((*shape[:2], 1), seed=1)
+    mask = np.random.default_rng(2).random((*shape[:2], 1)) < 0.7
+    expected = np.zeros_like(image)
+    hidden = np.where(mask, by, -np.inf)
+    for y, x in np.ndindex(*shape[:2]):
+        at = near(y, x, shape, window)
+        if mask[at].any():
+            place = np.unravel_index(hidden[at].argmax(), hidden[at].shape)[:2]
+            expected[y, x] = image[at][place]
+    run = jax.jit(lambda *i: windows.at_window_max(*i, window, mask=jnp.asarray(mask)))
+    broken = np.where(mask, image, np.nan)
+    found = run(jnp.asarray(np.where(mask, by, np.nan)), jnp.asarray(broken))
+    np.testing.assert_array_equal(found, expected)
+    check_grads(lambda i: run(jnp.asarray(by), i), (jnp.asarray(image),), 1, ["rev"])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_separable_sums_match_loops(shape):
+    image, kernel = jnp.asarray(images(shape)), jnp.asarray([0.5, 2.0, 1.0, 0.0, 3.0])
+    padded = np.pad(image, ((2, 2), (2, 2), (0, 0)))
+    weights = np.outer(kernel, kernel)[..., None]
+    expected = [
+        [(weights * padded[y : y + 5, x : x + 5]).sum((0, 1)) for x in range(shape[1])]
+        for y in range(shape[0])
+    ]
+    run = jax.jit(windows.separable_sum)
+    np.testing.assert_allclose(run(image, kernel), expected, atol=1e-12)
+    check_grads(run, (image, kernel), 1, ["rev"])
+    with pytest.raises(ValueError, match="window must be odd"):
+        windows.separable_sum(image, kernel[:4])
+
+
 @pytest.mark.parametrize("window", [3, 15])
 def test_masked_pixels_take_no_part(window):
     image = images((6, 7, 2))
