@@ -14,6 +14,7 @@ Three tables:
              as SURE estimates it and as it is, both relative to the denoised radiance
              squared (plus 0.01); and relative L2, less the reference's noise, of
              progressive mixing and of James-Stein, without and with the divergence.
+             Whitened: with the robust variance, and SURE by it.
 """
 
 import dataclasses
@@ -42,6 +43,7 @@ STEPS = [10.0**k for k in range(-6, 1)]
 PROBES = 1, 2, 4, 8
 WINDOW, KEYS = 31, 8
 PAPERS_STEP = 1e-4
+WHITENED = {"whiten": True, "window": 7}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,22 +172,28 @@ def measure(frame: Frame) -> dict[str, float]:
         "path tracing": error(x),
         "oidn": error(y),
     }
-    for window in (15, 31, 63):
-        alpha = progressive.mixing(x, y, v, s, window=window)
-        bound = progressive.bound_mixing(alpha, x, y, v)
-        row[f"progressive {window}x{window}"] = error(x + alpha * (y - x))
-        row[f"progressive {window}x{window}, bounded"] = error(x + bound * (y - x))
-    bound = progressive.bound_mixing(jnp.ones_like(x), x, y, v)
-    row["oidn, bounded"] = error(x + bound * (y - x))
     smooth, robust = james_stein.smooth_variance(v), james_stein.robust_variance(v)
-    for name, variance, options in (
-        ("james-stein", smooth, {}),
-        ("james-stein whitened", robust, {"whiten": True, "window": 7}),
-        ("james-stein whitened 15x15", robust, {"whiten": True}),
+    of_robust = estimate(robust)
+
+    def add(name: str, alpha: Image) -> None:
+        bound = progressive.bound_mixing(alpha, x, y, v)
+        row[name] = error(x + alpha * (y - x))
+        row[f"{name}, bounded"] = error(x + bound * (y - x))
+
+    add("oidn itself", jnp.ones_like(x))
+    add("progressive", progressive.mixing(x, y, v, s))
+    for window in (7, 15):
+        alpha = progressive.mixing(
+            x, y, robust, of_robust.squared_error, window=window, whiten=True
+        )
+        add(f"progressive, whitened {window}x{window}", alpha)
+    for name, variance, divergence, options in (
+        ("james-stein", smooth, estimate(smooth).divergence, {}),
+        ("james-stein, whitened 7x7", robust, of_robust.divergence, WHITENED),
     ):
         run = functools.partial(james_stein.combine, x, y, variance, **options)
         row[name] = error(run())
-        row[f"{name}, corrected"] = error(run(divergence=estimate(variance).divergence))
+        row[f"{name}, corrected"] = error(run(divergence=divergence))
     return row
 
 

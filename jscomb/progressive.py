@@ -96,7 +96,8 @@ def mixing(
     variance: Variance,
     sure: Image,
     *,
-    window: int = 31,
+    window: int = 15,
+    whiten: bool = False,
 ) -> Image:
     """Mixing of least estimated error over windows, without a network.
 
@@ -106,6 +107,9 @@ def mixing(
         variance: v, squared radiance, at least zero, shape [H,W,C].
         sure: s, squared radiance, of either sign, shape [H,W,C].
         window: width of the windows in pixels, odd.
+        whiten: count each pixel in units of its own variance, so that the noisiest do
+            not decide for the window; those of variance 0 do not count. Wants a robust
+            variance, such as `james_stein.robust_variance`, in `sure` as well.
 
     Returns:
         alpha, in [0, 1], shape [H,W,C]; 1 where x and y are the same all over the
@@ -120,8 +124,12 @@ def mixing(
     valid = finite(unbiased, biased, variance, sure)
     images = unbiased, biased, variance, sure
     x, y, v, s = (jnp.where(valid, image, 0.0) for image in images)
-    square = window_sum(jnp.square(y - x), window)
-    gain = window_sum(v - s, window) + square  # what SURE says that y saves
+    square, saved = jnp.square(y - x), v - s
+    if whiten:
+        counted = v > 0
+        square, saved = (divide(i, v, where=counted) for i in (square, saved))
+    square = window_sum(square, window)
+    gain = window_sum(saved, window) + square
     some = square > 0
     ratio = divide(gain, 2 * square, where=some, otherwise=1.0)
     return jnp.clip(ratio, 0.0, 1.0)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import render, scenes
+from experiments import progressive, render, scenes
 from jscomb import exr
 from tests.statistics import assert_mean, assert_mean_below
 
@@ -233,3 +233,24 @@ def test_bad_configurations(tmp_path):
     (tmp_path / "y.xml").write_text("<scene")
     with pytest.raises(ValueError, match=r"y\.xml: not XML"):
         scenes.load(str(tmp_path / "y.xml"), width=0, height=0)
+
+
+def test_a_progressive_rendering_knows_its_error(tmp_path):
+    """Stages of doubling samples; errors fall; it stops where it was asked to."""
+    config = progressive.Config(
+        "cornell-box", tmp_path, size=24, spp=32, first=8, reference_spp=256
+    )
+    found = progressive.run(config)
+    assert list(found) == [8, 16, 32]
+    for samples, row in found.items():
+        assert (tmp_path / f"{samples:05d}.png").stat().st_size > 10_000
+        for true, estimated in row.values():
+            assert np.isfinite([true, estimated]).all()
+        true, estimated = row["samples"]
+        assert 0.3 * true < estimated < 3 * true
+    assert found[32]["samples"][0] < found[8]["samples"][0]
+    assert (tmp_path / "errors.png").exists()
+    sooner = dataclasses.replace(config, target=1e9)
+    assert list(progressive.run(sooner)) == [32]  # all that was there already
+    with pytest.raises(ValueError, match="first must be from 2 to spp = 32: 1"):
+        dataclasses.replace(config, first=1)

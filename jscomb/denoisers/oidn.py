@@ -106,14 +106,15 @@ def _filter_jvp(
 ) -> tuple[Array, Array]:
     """Central difference; its step moves the typical pixel by `_STEP` of its value.
 
-    The typical one of those that move at all: with the largest as measure the steps of
-    all others would be lost to rounding beside a firefly.
+    The typical one (geometric mean) of those that move at all: with the largest as
+    measure the steps of all others would be lost to rounding beside a firefly.
     """
     size = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(primals)])
     speed = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(tangents)])
-    relative = jnp.where(speed > 0, speed / (size + 1), jnp.nan)
-    typical = jnp.nanmedian(relative)
-    step = jnp.where(typical > 0, _STEP / jnp.where(typical > 0, typical, 1.0), 1.0)
+    moves = speed > 0
+    relative = jnp.log(jnp.where(moves, speed, 1.0) / (size + 1))
+    count = jnp.maximum(jnp.sum(moves), 1).astype(relative.dtype)
+    step = _STEP * jnp.exp(-jnp.sum(jnp.where(moves, relative, 0.0)) / count)
     at = lambda side: _filter(
         *jax.tree.map(lambda p, t: p + side * step * t, primals, tangents)
     )
