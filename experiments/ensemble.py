@@ -15,7 +15,6 @@ Results are kept in the file as they come, and what is in it is not measured aga
 import dataclasses
 import functools
 import itertools
-import json
 import pathlib
 from collections.abc import Callable, Sequence
 
@@ -23,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from experiments import frames
 from experiments.bases import BASES, bases_of, stacked, unbiased_of
@@ -217,19 +215,9 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: if the folder holds no archive.
     """
-    cases = frames.cases(config.folder, quick=config.quick)
-    found: dict[str, dict[str, float]] = {}
-    if config.results is not None and config.results.exists():
-        found = json.loads(config.results.read_text())
-    for path, samples in tqdm(cases, unit="frame"):
-        name = f"{path.stem} {samples}"
-        if name in found:
-            continue
-        frame = frames.load(path, samples)
-        found[name] = measure(frame.scaled(1 / frame.exposure))
-        if config.results is not None:
-            config.results.write_text(json.dumps(found, indent=1))
-    return found
+    return frames.measured(
+        config.folder, {"": measure}, results=config.results, quick=config.quick
+    )
 
 
 def scores(rows: Sequence[dict[str, float]], names: Sequence[str]) -> dict[str, float]:

@@ -6,10 +6,13 @@ and `full_oidn_S`; features `a_albedo` and so on; `reference`, and the differenc
 halves, `reference_half_difference`.
 """
 
+import json
 import pathlib
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from jscomb.frame import CHANNELS, Biased, Frame, Reference, make_frame
 
@@ -85,3 +88,43 @@ def cases(
         raise ValueError(f"{folder}: no .npz archive there")
     every = [(path, samples) for path in paths for samples in sample_counts(path)]
     return every[:1] if quick else every
+
+
+def measured(
+    folder: pathlib.Path,
+    measures: Mapping[str, Callable[[Frame], dict[str, float]]],
+    *,
+    results: pathlib.Path | None = None,
+    quick: bool = False,
+) -> dict[str, dict[str, float]]:
+    """Measure all frames of a folder, each brought to an exposure of one.
+
+    Args:
+        folder: of archives.
+        measures: functions of a frame to numbers by name; what each is called.
+        results: file that results are kept in as they come; what is in it is not
+            measured again. None to keep none.
+        quick: only the first frame.
+
+    Returns:
+        the numbers by "frame samples measure"; by "frame samples" where a measure is
+        called "".
+
+    Raises:
+        ValueError: if the folder holds no archive.
+    """
+    found: dict[str, dict[str, float]] = {}
+    if results is not None and results.exists():
+        found = json.loads(results.read_text())
+    for path, samples in tqdm(cases(folder, quick=quick), unit="frame"):
+        names = {f"{path.stem} {samples} {kind}".strip(): kind for kind in measures}
+        missing = {name: kind for name, kind in names.items() if name not in found}
+        if not missing:
+            continue
+        frame = load(path, samples)
+        frame = frame.scaled(1 / frame.exposure)
+        for name, kind in missing.items():
+            found[name] = measures[kind](frame)
+            if results is not None:
+                results.write_text(json.dumps(found, indent=1))
+    return found

@@ -10,14 +10,14 @@ what is in it is not measured again.
 """
 
 import dataclasses
-import json
+import functools
 import pathlib
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from experiments import frames
 from jscomb import james_stein
@@ -128,27 +128,23 @@ def run(config: Config) -> dict[str, Row]:
     Raises:
         ValueError: if the folder holds no archive.
     """
-    cases = frames.cases(config.folder, quick=config.quick)
-    found: dict[str, Row] = {}
-    if config.results is not None and config.results.exists():
-        found = json.loads(config.results.read_text())
-    for path, samples in tqdm(cases, unit="frame"):
-        frame = frames.load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
-        for base in (*BASES, "NFOR"):
-            name = f"{path.stem} {samples} {base}"
-            if name in found:
-                continue
-            if base == "NFOR":
-                assert frame.reference is not None
-                r, noise = frame.reference
-                image = nfor.denoise_frame(frame).full
-                found[name] = {"y": float(rel_l2(image, r, half_difference=noise))}
-            else:
-                found[name] = measure(frame, base, config)
-            if config.results is not None:
-                config.results.write_text(json.dumps(found, indent=1))
-    return found
+    measures: dict[str, Callable[[Frame], Row]] = {
+        base: functools.partial(measure, name=base, config=config) for base in BASES
+    }
+    return frames.measured(
+        config.folder,
+        measures | {"NFOR": measure_nfor},
+        results=config.results,
+        quick=config.quick,
+    )
+
+
+def measure_nfor(frame: Frame) -> Row:
+    """Relative L2 of NFOR."""
+    assert frame.reference is not None
+    r, noise = frame.reference
+    image = nfor.denoise_frame(frame).full
+    return {"y": float(rel_l2(image, r, half_difference=noise))}
 
 
 def main() -> None:
