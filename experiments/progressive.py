@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from experiments import render
 from experiments.sure_error import oidn_of
-from jscomb import plots, progressive
+from jscomb import james_stein, plots, progressive
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
@@ -82,8 +82,12 @@ def stages(config: Config) -> Iterator[Frame]:
 def mixed(frame: Frame) -> dict[str, tuple[Image, Image]]:
     """Samples, denoised and mixed image, each with its estimated squared error."""
     x, v = frame.color, frame.variance
-    y, s, _ = sure.monte_carlo_sure(jax.random.key(0), oidn_of(frame), x, v)
-    alpha = progressive.mixing(x, y, v, s)
+    key, denoise = jax.random.key(0), oidn_of(frame)
+    y, s, _ = sure.monte_carlo_sure(key, denoise, x, v)
+    # To mix by, no pixel shall be more certain than those around it.
+    robust = james_stein.robust_variance(v)
+    by = sure.monte_carlo_sure(key, denoise, x, robust).squared_error
+    alpha = progressive.mixing(x, y, robust, by, whiten=True)
     alpha = progressive.bound_mixing(alpha, x, y, v)
     z = (1 - alpha) * x + alpha * y
     risk = progressive.risk(alpha, x, y, v, s)
