@@ -82,11 +82,11 @@ def stages(config: Config) -> Iterator[Frame]:
 def mixed(frame: Frame) -> dict[str, tuple[Image, Image]]:
     """Samples, denoised and mixed image, each with its estimated squared error."""
     x, v = frame.color, frame.variance
-    key, denoise = jax.random.key(0), oidn_of(frame)
-    y, s, _ = sure.monte_carlo_sure(key, denoise, x, v)
+    estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), oidn_of(frame), x, v)
+    y, s, _ = estimate(v)
     # To mix by, no pixel shall be more certain than those around it.
     robust = james_stein.robust_variance(v)
-    by = sure.monte_carlo_sure(key, denoise, x, robust).squared_error
+    by = estimate(robust).squared_error
     alpha = progressive.mixing(x, y, robust, by, whiten=True)
     alpha = progressive.bound_mixing(alpha, x, y, v)
     z = (1 - alpha) * x + alpha * y

@@ -159,7 +159,7 @@ def measure(frame: Frame) -> dict[str, float]:
     x, v = frame.color, frame.variance
     error = lambda image: float(rel_l2(image, r, half_difference=noise))
     denoise = jax.jit(oidn_of(frame))
-    estimate = functools.partial(sure.monte_carlo_sure, jax.random.key(0), denoise, x)
+    estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), denoise, x, v)
     risk = estimate(v)
     y, s = risk.denoised, risk.squared_error
     weight = 1 / (jnp.square(jnp.mean(r, axis=-1, keepdims=True)) + 0.01)

@@ -46,8 +46,10 @@ DENOISERS = {"linear": linear, "bilateral": cross, "network": network}
 CALLS = 20000
 
 
-@pytest.mark.parametrize("probe", ["rademacher", "gaussian"])
-@pytest.mark.parametrize("name", DENOISERS)
+@pytest.mark.parametrize(
+    ("name", "probe"),
+    [*((name, "rademacher") for name in DENOISERS), ("network", "gaussian")],
+)
 def test_unbiased(name, probe):
     """For the true squared error: of single elements, and of the mean."""
     denoise = DENOISERS[name]
@@ -66,7 +68,7 @@ def test_unbiased(name, probe):
         assert_mean(excess[:, *place], 0)
 
 
-@pytest.mark.parametrize("name", DENOISERS)
+@pytest.mark.parametrize("name", ["linear", "network"])
 def test_probes_average_to_the_exact_divergence(name):
     """Four of them with half the spread of one."""
     denoise = DENOISERS[name]
