@@ -1,13 +1,11 @@
 """The bases of the ensemble experiments: six real denoisers, each with halves."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 
 from jscomb.denoisers import bilateral, nonlocal_means, of_parts, oidn, rdfc, smoothing
 from jscomb.frame import Biased, Frame
-from jscomb.typing import Image
 
 _means = jax.jit(nonlocal_means.denoise)
 _gaussian = jax.jit(smoothing.gaussian)
@@ -26,7 +24,7 @@ BASES: dict[str, Callable[[Frame], Biased]] = {
 }
 
 
-def bases_of(frame: Frame) -> list[Biased]:
+def bases_of(frame: Frame) -> dict[str, Biased]:
     """The bases of a frame and of its halves, in the order of `BASES`.
 
     Args:
@@ -35,15 +33,9 @@ def bases_of(frame: Frame) -> list[Biased]:
     Returns:
         the biased images, with halves.
     """
-    return [make(frame) for make in BASES.values()]
+    return {name: make(frame) for name, make in BASES.items()}
 
 
 def unbiased_of(frame: Frame) -> Biased:
     """The unbiased image as one more base."""
     return of_parts(frame, lambda part: part.color, variance=False)
-
-
-def stacked(bases: Sequence[Biased]) -> tuple[Image, Image, Image]:
-    """Full images, and those of both halves, [N,H,W,C] each."""
-    full, a, b = zip(*((i.full, *i.halves) for i in bases), strict=True)
-    return jnp.stack(full), jnp.stack(a), jnp.stack(b)

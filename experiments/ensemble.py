@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from experiments import frames
-from experiments.bases import BASES, bases_of, stacked, unbiased_of
+from experiments.bases import BASES, bases_of, unbiased_of
 from experiments.timing import medians
 from jscomb import ensemble
 from jscomb.denoisers import nonlocal_means
@@ -178,10 +178,10 @@ def measure(frame: Frame) -> dict[str, float]:
     x_a, x_b = (half.color for half in frame.halves())
     rest = x_a, x_b, frame.variance, frame.albedo, frame.normal
     bases = bases_of(frame)
-    unbiased = unbiased_of(frame)
     row = {"path tracing": error(frame.color)}
-    row |= {n: error(b.full) for n, b in zip(BASES, bases, strict=True)}
-    some, more = stacked(bases), stacked([*bases, unbiased])
+    row |= {name: error(base.full) for name, base in bases.items()}
+    some = ensemble.stack_bases(bases)
+    more = ensemble.stack_bases(bases | {"x": unbiased_of(frame)})
 
     def add(name: str, method: Callable, images: Sequence[Image]) -> None:
         call = functools.partial(method, *images, *rest)
@@ -194,11 +194,12 @@ def measure(frame: Frame) -> dict[str, float]:
             add(f"{name} and x", method, more)
     ours, names = METHODS["multi-scale"], list(BASES)
     for count in range(2, len(names)):
-        for subset in itertools.combinations(range(len(names)), count):
-            images = stacked([bases[k] for k in subset])
-            row[" + ".join(names[k] for k in subset)] = error(ours(*images, *rest))
-    chosen = ensemble.select_bases(some[1], some[2], x_a, x_b).kept
-    add("selected", ours, stacked([bases[k] for k in chosen]))
+        for subset in itertools.combinations(names, count):
+            images = ensemble.stack_bases({name: bases[name] for name in subset})
+            row[" + ".join(subset)] = error(ours(*images, *rest))
+    chosen = ensemble.select_bases(some.biased_a, some.biased_b, x_a, x_b).kept
+    needed = {names[k]: bases[names[k]] for k in chosen}
+    add("selected", ours, ensemble.stack_bases(needed))
     row["selected, number"] = len(chosen)
     return row
 

@@ -25,7 +25,7 @@ import tyro
 from tqdm import tqdm
 
 from experiments import frames
-from experiments.bases import bases_of, stacked, unbiased_of
+from experiments.bases import bases_of, unbiased_of
 from experiments.timing import medians
 from jscomb import ensemble
 from jscomb.denoisers import of_parts, smoothing
@@ -83,7 +83,8 @@ def problems(config: Config, size: int) -> list[jax.Array]:
     frame = frames.load(config.folder / f"{config.frame}.npz", config.samples)
     frame = frame.scaled(1 / frame.exposure)
     box = of_parts(frame, lambda part: smoothing.box(part.color), variance=False)
-    _, a, b = stacked([*bases_of(frame), unbiased_of(frame), box])
+    more = {"x": unbiased_of(frame), "box": box}
+    _, a, b = ensemble.stack_bases(bases_of(frame) | more)
     x = jnp.stack([half.color for half in frame.halves()])
     a, b, (x_a, x_b) = (repeated(images, size) for images in (a, b, x))
     return [a, b, x_a, x_b]

@@ -19,7 +19,7 @@ import tyro
 from tqdm import tqdm
 
 from experiments import render
-from experiments.bases import BASES, bases_of, stacked
+from experiments.bases import BASES, bases_of
 from jscomb import ensemble
 from jscomb.frame import Buffers, Frame
 from jscomb.metrics import rel_l2
@@ -124,7 +124,7 @@ def measure(config: Config, scene: str) -> dict[str, float]:
     every = renderings_of(frame)
     bases, unbiased = [], []
     for rendering in tqdm(every, unit="rendering", desc=scene):
-        bases.append(stacked(bases_of(rendering)))
+        bases.append(ensemble.stack_bases(bases_of(rendering)))
         unbiased.append([half.color for half in rendering.halves()])
     full, a, b = (jnp.stack(i) for i in zip(*bases, strict=True))
     x_a, x_b = (jnp.stack(i) for i in zip(*unbiased, strict=True))

@@ -30,6 +30,8 @@ Sources:
     Renderings", 2021 (ED; eq. numbers below). The scales are ours.
 """
 
+from jscomb.ensemble.bases import Stacked as Stacked
+from jscomb.ensemble.bases import stack_bases as stack_bases
 from jscomb.ensemble.errors import error_matrix as error_matrix
 from jscomb.ensemble.errors import mse_matrix as mse_matrix
 from jscomb.ensemble.errors import true_matrix as true_matrix

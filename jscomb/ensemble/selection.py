@@ -15,6 +15,9 @@ from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image
 
 
+_ROUNDING = 1e-6
+
+
 class Selected(NamedTuple):
     """Which bases an ensemble needs.
 
@@ -64,7 +67,8 @@ def select_bases(
     while len(kept) > 1:
         without = {i: _judged(halves, [k for k in kept if k != i]) for i in kept}
         worst = min(without, key=lambda i: without[i])
-        if without[worst] > errors[-1]:
+        # A base without weight changes the error by rounding alone.
+        if without[worst] > errors[-1] + _ROUNDING * abs(errors[-1]):
             break
         kept.remove(worst)
         errors.append(without[worst])
