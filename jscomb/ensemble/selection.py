@@ -14,7 +14,6 @@ from jscomb.numerics import simplex
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image
 
-
 _ROUNDING = 1e-6
 
 
