@@ -203,12 +203,14 @@ def run(config: Config) -> dict:
     Raises:
         ValueError: if the folder holds no archive.
     """
+    path, samples = config.folder / f"{config.frame}.npz", config.samples
+    if config.quick:
+        path, samples = frames.cases(config.folder, quick=True)[0]
+    frame = frames.load(path, samples)  # before the long part, in case it is missing
+    frame = frame.scaled(1 / frame.exposure)
     found = frames.measured(
         config.folder, {"": measure}, results=config.results, quick=config.quick
     )
-    path, samples = config.folder / f"{config.frame}.npz", config.samples
-    frame = frames.load(path, samples)
-    frame = frame.scaled(1 / frame.exposure)
     counts, repeats = (PROBES[:1], 1) if config.quick else (PROBES, config.repeats)
     return {
         "digits": digits(frame),

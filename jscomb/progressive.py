@@ -44,6 +44,8 @@ from jscomb.typing import Image, Variance
 
 Mixing = Callable[[Image, Image, Variance, Image], Image]
 
+# What one pixel may weigh, times the rounding error: finite however small its variance.
+_MOST_EVIDENCE = 1e4
 _NARROWEST, _WIDEST = 1e-3, 100.0  # of the bound's Gaussian, in pixels
 
 
@@ -126,8 +128,9 @@ def mixing(
     x, y, v, s = (jnp.where(valid, image, 0.0) for image in images)
     square, saved = jnp.square(y - x), v - s
     if whiten:
-        counted = v > 0
-        square, saved = (divide(i, v, where=counted) for i in (square, saved))
+        most = _MOST_EVIDENCE / float(jnp.finfo(v.dtype).eps)
+        unit = jnp.maximum(v, jnp.maximum(square, jnp.abs(saved)) / most)
+        square, saved = (divide(i, unit, where=v > 0) for i in (square, saved))
     square = window_sum(square, window)
     gain = window_sum(saved, window) + square
     some = square > 0

@@ -157,6 +157,21 @@ def test_certain_pixels_are_kept():
             assert np.isfinite(gradient).all()
 
 
+@pytest.mark.parametrize("firefly", [1.0, 1e6])
+def test_whitened_stays_finite_however_certain_a_pixel(firefly):
+    """In float32: without the cap 1e12 / 1e-30 would be infinite, and the ratio NaN."""
+    x, y, v = (i.astype(jnp.float32) for i in (X, Y, V))
+    x, v = x.at[4, 5].set(firefly), v.at[4, 5].set(1e-30).at[9, 9].set(0.0)
+    s = (y - x) ** 2 - v
+    run = lambda *i: progressive.mixing(*i, window=5, whiten=True)
+    alpha = jax.jit(run)(x, y, v, s)
+    assert ((alpha >= 0) & (alpha <= 1)).all()
+    assert (alpha[2:7, 3:8] < 1e-3).all()  # the certain pixel decides for its windows
+    total = lambda *i: jnp.sum(run(*i) * X.astype(jnp.float32))
+    for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(x, y, v, s):
+        assert np.isfinite(gradient).all()
+
+
 def test_gradients():
     y = X + 0.2 * (Y - X)
     small = lambda *images: [i[:6, :7] for i in images]
