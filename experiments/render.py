@@ -19,20 +19,21 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-from experiments import scenes
+from experiments import scenes, streams
 from jscomb import exr
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame, Reference, make_frame
 
 REFERENCE_CHUNK = 16  # samples of one reference pass: bounds memory, saves launches
-TOLD = ("scene", "spp", "buffers", "feature_spp", "reference_spp", "seed")
+TOLD = ("scene", "spp", "buffers", "feature_spp", "reference_spp")
+TOLD += ("seed", "numbers", "tile")
 SAVE_EVERY = 20.0  # seconds between two saves of the work so far
 
 
@@ -51,6 +52,10 @@ class Config:
         feature_spp: samples a pixel of each sub-buffer's features.
         reference_spp: samples a pixel of the reference; 0 renders none.
         reference_from: take the reference of this frame file instead.
+        numbers: the random numbers of different pixels: independent, or common, the
+            same for all.
+        tile: width in pixels of the tiles that common numbers are common to; 0 for one
+            over the whole frame.
         seed: first random stream; frames and references with streams apart are
             independent (one stream a pass).
         denoise: run Open Image Denoise on the frame and its halves.
@@ -66,13 +71,17 @@ class Config:
     feature_spp: int = 16
     reference_spp: int = 0
     reference_from: pathlib.Path | None = None
+    numbers: Literal["independent", "common"] = "independent"
+    tile: int = 0
     seed: int = 0
     denoise: bool = True
 
     def __post_init__(self) -> None:
         """Reject sizes and counts that cannot be rendered."""
-        if min(self.size, self.width, self.height, self.seed) < 0:
-            raise ValueError("size, width, height and seed must not be negative")
+        if min(self.size, self.width, self.height, self.tile, self.seed) < 0:
+            raise ValueError("size, width, height, tile and seed must not be negative")
+        if self.numbers == "common" and self.reference_spp:
+            raise ValueError("a reference wants independent random numbers")
         if self.feature_spp < 1:
             raise ValueError(f"feature_spp must be positive, got {self.feature_spp}")
         k = self.buffers
@@ -150,8 +159,19 @@ def launcher(config: Config) -> Callable[[Pass], np.ndarray]:
     """
     mi = scenes.mitsuba()
     width, height = config.width or config.size, config.height or config.size
-    scene = scenes.load(config.scene, width=width, height=height)
-    columns, rows = scene.sensors()[0].film().size()
+    common = config.numbers == "common"
+    if common:
+        streams.register(mi)
+    scene = scenes.load(
+        config.scene,
+        width=width,
+        height=height,
+        sampler=streams.NAME if common else "independent",
+    )
+    sensor = scene.sensors()[0]
+    columns, rows = sensor.film().size()
+    if common:
+        sensor.sampler().columns, sensor.sampler().tile = int(columns), config.tile
     if config.reference_from:  # found out now, not after the last pass
         shape = _borrowed(config.reference_from).image.shape
         if shape != (rows, columns, 3):

@@ -8,7 +8,7 @@ The own scenes grow from `mitsuba.cornell_box()`:
 
 Every scene is loaded with what unbiased statistics need, whatever its author chose:
 a float32 film in linear RGB, a box reconstruction filter (so that pixels are
-independent), the independent sampler and the path integrator.
+independent), the independent sampler or a given one, and the path integrator.
 """
 
 import ctypes
@@ -58,13 +58,14 @@ def _find_llvm() -> str | None:
     return None
 
 
-def load(name: str, *, width: int, height: int):
+def load(name: str, *, width: int, height: int, sampler: str = "independent"):
     """Load one of the own scenes by name, or a Mitsuba XML file by path.
 
     Args:
         name: a key of `SCENES`, or the path of an XML file.
         width: of the film in pixels; 0 keeps the file's own (own scenes: 256).
         height: of the film in pixels; 0 likewise.
+        sampler: name of a Mitsuba sampler.
 
     Returns:
         the `mitsuba.Scene`.
@@ -77,7 +78,7 @@ def load(name: str, *, width: int, height: int):
         scene = SCENES[name](mi)
         scene["sensor"] |= {
             "film": _film(width or 256, height or 256),
-            "sampler": {"type": "independent"},
+            "sampler": {"type": sampler},
         }
         scene["integrator"] = {"type": "path", "max_depth": MAX_DEPTH}
         return mi.load_dict(scene)
@@ -86,7 +87,7 @@ def load(name: str, *, width: int, height: int):
         known = ", ".join(SCENES)
         raise ValueError(f"{name!r} is neither a file nor one of the scenes {known}")
     mi.file_resolver().append(str(path.parent.resolve()))
-    return mi.load_string(_standard_xml(path, width, height))
+    return mi.load_string(_standard_xml(path, width, height, sampler))
 
 
 def _film(width: int, height: int) -> dict:
@@ -101,7 +102,7 @@ def _film(width: int, height: int) -> dict:
     }
 
 
-def _standard_xml(path: pathlib.Path, width: int, height: int) -> str:
+def _standard_xml(path: pathlib.Path, width: int, height: int, sampler: str) -> str:
     """The scene file's text with its film, sampler and integrator made standard."""
     try:
         tree = ElementTree.parse(path).getroot()
@@ -123,7 +124,7 @@ def _standard_xml(path: pathlib.Path, width: int, height: int) -> str:
     film = _film(size("width", width), size("height", height))
     for old in [*sensor.findall("film"), *sensor.findall("sampler")]:
         sensor.remove(old)
-    ElementTree.SubElement(sensor, "sampler", type="independent")
+    ElementTree.SubElement(sensor, "sampler", type=sampler)
     node = ElementTree.SubElement(sensor, "film", type=film["type"])
     ElementTree.SubElement(node, "rfilter", type=film["rfilter"]["type"])
     for name in ("pixel_format", "component_format"):

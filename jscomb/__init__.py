@@ -17,5 +17,6 @@ from jscomb import james_stein as james_stein
 from jscomb import metrics as metrics
 from jscomb import numerics as numerics
 from jscomb import progressive as progressive
+from jscomb import uncorrelated as uncorrelated
 
 __version__ = "0.1.0"

@@ -22,6 +22,7 @@ ROOMS = [
     "james_stein",
     "ensemble",
     "progressive",
+    "uncorrelated",
     "denoisers",
     "exr",
     "plots",
@@ -29,7 +30,7 @@ ROOMS = [
     "__main__",
     "jscomb",
 ]
-COMBINERS = {"james_stein", "ensemble", "progressive"}
+COMBINERS = {"james_stein", "ensemble", "progressive", "uncorrelated"}
 ROOT = pathlib.Path(__file__).parents[1]
 MODULES = [
     importlib.import_module(m.name)

@@ -19,13 +19,11 @@ Sources:
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import divide, finite
-from jscomb.numerics.tiles import Grid, Planes, Region, sum_over_tiles
+from jscomb.numerics.tiles import Grid, Planes, Region, fold_rows, sum_over_tiles
 from jscomb.numerics.windows import check_window
 
 Plane = Float[Array, "_ _"]
@@ -81,23 +79,19 @@ def bilateral_mean(
         middle = slice(reach, reach + tile)
         centre = [planes[:, middle, middle] for planes in near]
 
-        # The planes move up a row a turn: to read them at a row not known beforehand
-        # would take several times as long.
-        @jax.checkpoint
         def add_row(
-            carry: tuple[Planes, list[Planes]], dy: Array
-        ) -> tuple[tuple[Planes, list[Planes]], None]:
-            total, moved = carry
+            carry: tuple[Planes, Array], moved: list[Planes]
+        ) -> tuple[Planes, Array]:
+            total, dy = carry
             for dx in range(window):
                 q = [planes[:, :tile, dx : dx + tile] for planes in moved]
                 away = (dy**2 + (dx - reach) ** 2) / (2 * sigma**2)
                 weight = jnp.exp(-(_distance(centre[1:], q[1:]) + away))
                 total = total + weight[None] * q[0]
-            return (total, [jnp.roll(planes, -1, axis=1) for planes in moved]), None
+            return total, dy + 1
 
-        dy = jnp.arange(window, dtype=image.dtype) - reach
-        start = jnp.zeros_like(centre[0]), list(near)
-        return lax.scan(add_row, start, dy)[0][0]
+        start = jnp.zeros_like(centre[0]), jnp.asarray(-reach, image.dtype)
+        return fold_rows(add_row, start, near, window)[0]
 
     sums = sum_over_tiles(mean, regions, grid, reach=0)
     sums = jnp.moveaxis(sums, 0, -1)

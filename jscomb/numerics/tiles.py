@@ -10,7 +10,7 @@ time. Reverse mode works each batch out again rather than remember it.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 Planes = Float[Array, "_ _ _"]  # [K,H,W], or a part of it
+Carry = TypeVar("Carry")
 
 
 class Grid(NamedTuple):
@@ -149,6 +150,37 @@ def sum_over_tiles(
     sums = lax.map(jax.checkpoint(strip), jnp.arange(rows))
     total = _paste(sums, grid.step, (rows - 1) * grid.step + size, axis=1)
     return total[:, reach : reach + height, reach : reach + width]
+
+
+def fold_rows(
+    add_row: Callable[[Carry, list[Planes]], Carry],
+    start: Carry,
+    near: Sequence[Planes],
+    window: int,
+) -> Carry:
+    """Fold over the rows of the windows of a tile.
+
+    The planes move up a row a turn: to read them at a row not known beforehand would
+    take several times as long. Reverse mode works each row out again.
+
+    Args:
+        add_row: of what was made so far and the planes, moved so that the window's row
+            of their first row's pixels is that row itself, to what is made with it.
+        start: what `add_row` is first given, arrays.
+        near: a tile's regions.
+        window: rows of a window in pixels.
+
+    Returns:
+        what the last `add_row` made.
+    """
+
+    @jax.checkpoint
+    def step(carry: tuple[Carry, list[Planes]], _) -> tuple:
+        made, moved = carry
+        made = add_row(made, moved)
+        return (made, [jnp.roll(planes, -1, axis=1) for planes in moved]), None
+
+    return lax.scan(step, (start, list(near)), None, length=window)[0][0]
 
 
 def flat(planes: Planes) -> Float[Array, "k n"]:

@@ -1,0 +1,94 @@
+"""Kernels: weights as a function of what B sub-averages say of a difference.
+
+A kernel takes B arrays of one shape, the differences D_ci z^1, ..., D_ci z^B, and gives
+weights in [0, 1] of that shape, element by element.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jscomb.typing import Key, Scalar
+from jscomb.uncorrelated.pairs import Samples, check_samples
+
+Kernel = Callable[..., Array]
+
+_TRIALS = 4096
+
+
+def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
+    """The paper's kernel: less weight where two sub-averages tell of more noise.
+
+    Args:
+        gamma: at least zero, per squared radiance.
+        samples: n, samples a pixel in each sub-average, at least 1.
+
+    Returns:
+        a kernel of two differences.
+
+    Raises:
+        ValueError: if `samples` is less than 1.
+
+    Source: IDU eq. 8.
+    """
+    check_samples(samples)
+
+    def kernel(first: Array, second: Array) -> Array:
+        rate = jnp.asarray(gamma * samples, first.dtype)
+        return jnp.exp(-rate * jnp.square(first - second))
+
+    return kernel
+
+
+class Admissibility(NamedTuple):
+    """What theorem 2 asks of a kernel: both are zero, but for rounding.
+
+    Attributes:
+        shift: greatest change of a weight when a constant is added to all differences.
+        sign: greatest change of a weight when all differences change sign.
+    """
+
+    shift: Scalar
+    sign: Scalar
+
+
+def admissibility(
+    key: Key, kernel: Kernel, *, sub_averages: int = 2, scale: float = 1.0
+) -> Admissibility:
+    """Try a kernel on random differences.
+
+    Args:
+        key: of the differences and the constants.
+        kernel: of `sub_averages` arrays.
+        sub_averages: B.
+        scale: the differences' typical size, linear radiance: about where the weights
+            fall.
+
+    Returns:
+        how much it departs from what makes a combination unbiased.
+
+    Example:
+        >>> by_noise = lambda first, second: jnp.exp(-((first - second) ** 2))
+        >>> by_mean = lambda first, second: jnp.exp(-((first + second) ** 2))
+        >>> for kernel in (by_noise, by_mean):
+        ...     found = admissibility(jax.random.key(0), kernel)
+        ...     print(f"{found.shift:.1f} {found.sign:.1f}")
+        0.0 0.0
+        1.0 0.0
+
+    Source: IDU eq. 7.
+    """
+    of_size, of_differences, of_constants = jax.random.split(key, 3)
+    # Over four decades: a kernel may do wrong at any size.
+    size = scale * 10 ** jax.random.uniform(of_size, (_TRIALS,), minval=-2, maxval=2)
+    shape = (sub_averages, _TRIALS)
+    differences = size[None] * jax.random.normal(of_differences, shape)
+    constants = size * jax.random.normal(of_constants, (_TRIALS,))
+    weights = kernel(*differences)
+    return Admissibility(
+        jnp.max(jnp.abs(kernel(*(differences + constants[None])) - weights)),
+        jnp.max(jnp.abs(kernel(*-differences) - weights)),
+    )
