@@ -86,8 +86,13 @@ def load(name: str, *, width: int, height: int, sampler: str = "independent"):
     if not path.is_file():
         known = ", ".join(SCENES)
         raise ValueError(f"{name!r} is neither a file nor one of the scenes {known}")
-    mi.file_resolver().append(str(path.parent.resolve()))
-    return mi.load_string(_standard_xml(path, width, height, sampler))
+    folders = mi.file_resolver()
+    # First, and not for longer: scenes call different meshes by the same names.
+    folders.prepend(str(path.parent.resolve()))
+    try:
+        return mi.load_string(_standard_xml(path, width, height, sampler))
+    finally:
+        del folders[0]
 
 
 def _film(width: int, height: int) -> dict:

@@ -10,6 +10,7 @@ from scipy.sparse.linalg import lsqr, spsolve
 
 from jscomb.numerics.poisson import reconstruct
 
+solve = jax.jit(reconstruct, static_argnames="alpha")
 SIZES = [(7, 9), (8, 8), (1, 6), (5, 1), (1, 1), (2, 3)]
 
 
@@ -54,7 +55,7 @@ def oracle(primal, gradient_x, gradient_y, alpha):
 def test_the_sparse_solution(shape, alpha):
     given = problem(shape)
     np.testing.assert_allclose(
-        jax.jit(lambda *g: reconstruct(*g, alpha=alpha))(*given),
+        solve(*given, alpha=alpha),
         oracle(*given, alpha),
         rtol=1e-9,
         atol=1e-9 * (1 + 1e-6 / alpha**2),
@@ -63,36 +64,35 @@ def test_the_sparse_solution(shape, alpha):
 
 def test_float32():
     given = tuple(g.astype(jnp.float32) for g in problem((33, 20)))
-    u = reconstruct(*given)
+    u = solve(*given)
     assert u.dtype == jnp.float32
     np.testing.assert_allclose(u, oracle(*given, 0.2), atol=3e-5)
 
 
 def test_exact_gradients_give_the_image_back():
     u = problem((9, 11))[0]
-    found = reconstruct(u, jnp.diff(u, axis=1), jnp.diff(u, axis=0))
+    found = solve(u, jnp.diff(u, axis=1), jnp.diff(u, axis=0))
     np.testing.assert_allclose(found, u, rtol=1e-11)
 
 
 def test_limits():
     """Nothing but the primal image counts, or nothing of it but its mean."""
     y, g, h = problem((8, 9))
-    np.testing.assert_allclose(reconstruct(y, g, h, alpha=1e5), y, atol=1e-8)
-    flat = reconstruct(y, 0 * g, 0 * h, alpha=1e-4)
+    np.testing.assert_allclose(solve(y, g, h, alpha=1e5), y, atol=1e-8)
+    flat = solve(y, 0 * g, 0 * h, alpha=1e-4)
     mean = jnp.broadcast_to(jnp.mean(y, axis=(0, 1)), y.shape)
     np.testing.assert_allclose(flat, mean, atol=1e-6)
 
 
 def test_gradients_and_vmap():
     given = problem((4, 5), channels=1)
-    solve = jax.jit(reconstruct)
     check_grads(solve, given, order=1, modes=["fwd", "rev"], rtol=1e-6)
     missing = given[0].at[1, 2].set(jnp.nan), *given[1:]
     both = jax.vmap(reconstruct)(
         *(jnp.stack(pair) for pair in zip(given, missing, strict=True))
     )
-    np.testing.assert_allclose(both[0], reconstruct(*given), rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(both[1], reconstruct(*missing), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(both[0], solve(*given), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(both[1], solve(*missing), rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e6])
@@ -100,8 +100,8 @@ def test_scale_equivariant(scale):
     given = tuple(g.astype(jnp.float32) for g in problem((16, 12)))
     s = jnp.float32(scale)
     np.testing.assert_allclose(
-        reconstruct(*(s * g for g in given)),
-        s * reconstruct(*given),
+        solve(*(s * g for g in given)),
+        s * solve(*given),
         rtol=1e-4,
         atol=2e-6 * scale,
     )
@@ -114,11 +114,11 @@ def test_missing_values_take_no_part(bad):
     y = y.at[2, 3, 0].set(bad).at[7, 7].set(bad)
     g = g.at[4, 4, 1].set(bad).at[7, 6:8].set(bad)
     h = h.at[0, 9].set(bad).at[6:8, 7].set(bad)
-    found = jax.jit(reconstruct)(y, g, h)
+    found = solve(y, g, h)
     assert np.all(found[7, 7] == 0)  # nothing is known of it
     expected = oracle(*(np.where(np.isfinite(i), i, np.nan) for i in (y, g, h)), 0.2)
     np.testing.assert_allclose(found, expected, atol=1e-7)
-    total = lambda *given: jnp.sum(jnp.sin(reconstruct(*given)))
+    total = lambda *given: jnp.sum(jnp.sin(solve(*given)))
     for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(y, g, h):
         assert np.isfinite(gradient).all()
 
@@ -127,13 +127,13 @@ def test_a_missing_pixel_of_z_keeps_its_own_estimate():
     """Nothing but y tells of it, so y it is."""
     y, g, h = problem((9, 10))
     cut = g.at[4, 4:6].set(jnp.nan), h.at[3:5, 5].set(jnp.nan)
-    np.testing.assert_allclose(reconstruct(y, *cut)[4, 5], y[4, 5], rtol=1e-8)
+    np.testing.assert_allclose(solve(y, *cut)[4, 5], y[4, 5], rtol=1e-8)
 
 
 def test_fireflies():
     y, g, h = (i.astype(jnp.float32) for i in problem((24, 24)))
     y = y.at[10, 12].set(1e6)
-    found = reconstruct(y, g, h)
+    found = solve(y, g, h)
     np.testing.assert_allclose(found, oracle(y, g, h, 0.2), rtol=1e-5, atol=0.2)
 
 

@@ -213,6 +213,17 @@ def test_a_scene_file_is_made_standard(tmp_path, mitsuba):
     assert np.isfinite(np.asarray(mitsuba.render(small, spp=2))).all()
 
 
+def test_scenes_keep_their_own_meshes(tmp_path, mitsuba):
+    """Two folders with a mesh of one name: the second scene's is not the first's."""
+    for name, ply in (("one", PLY), ("two", PLY.replace("9", "0.01"))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.xml").write_text(XML)
+        (tmp_path / name / "quad.ply").write_text(ply)
+        scene = scenes.load(str(tmp_path / name / "scene.xml"), width=0, height=0)
+        wide = scene.bbox().max.x
+        assert wide == pytest.approx(9 if name == "one" else 0.01)
+
+
 def test_bad_configurations(tmp_path):
     out = tmp_path / "x.exr"
     with pytest.raises(ValueError, match="buffers must be 1 or even, got 3"):
@@ -225,6 +236,8 @@ def test_bad_configurations(tmp_path):
         render.Config("cornell-box", out, feature_spp=0)
     with pytest.raises(ValueError, match="must not be negative"):
         render.Config("cornell-box", out, size=-8)
+    with pytest.raises(ValueError, match="a reference wants independent"):
+        render.Config("cornell-box", out, reference_spp=32, numbers="common")
     with pytest.raises(ValueError, match="neither a file nor one of the scenes"):
         scenes.load("cornel-box", width=0, height=0)
     (tmp_path / "x.xml").write_text("<scene version='3.0.0'/>")

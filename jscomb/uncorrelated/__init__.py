@@ -33,6 +33,8 @@ from jscomb.uncorrelated.combination import combine_with as combine_with
 from jscomb.uncorrelated.kernels import Admissibility as Admissibility
 from jscomb.uncorrelated.kernels import admissibility as admissibility
 from jscomb.uncorrelated.kernels import variance_kernel as variance_kernel
+from jscomb.uncorrelated.selection import MULTIPLES as MULTIPLES
+from jscomb.uncorrelated.selection import UNIT as UNIT
 from jscomb.uncorrelated.selection import Combined as Combined
 from jscomb.uncorrelated.selection import combine_frames as combine_frames
 from jscomb.uncorrelated.selection import relative_variances as relative_variances

@@ -37,10 +37,24 @@ def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
     check_samples(samples)
 
     def kernel(first: Array, second: Array) -> Array:
-        rate = jnp.asarray(gamma * samples, first.dtype)
+        rate = rate_of(gamma, samples, first.dtype)
         return jnp.exp(-rate * jnp.square(first - second))
 
     return kernel
+
+
+def rate_of(gamma: Scalar | float, samples: Samples, dtype: jnp.dtype | type) -> Scalar:
+    """Gamma n, what a squared difference is multiplied by.
+
+    Args:
+        gamma: per squared radiance.
+        samples: n, samples a pixel in each sub-average.
+        dtype: of the result.
+
+    Returns:
+        the product, per squared radiance.
+    """
+    return jnp.asarray(gamma, dtype) * jnp.asarray(samples, dtype)
 
 
 class Admissibility(NamedTuple):

@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from jscomb.numerics.guards import check_same_shape, finite, first_finite
-from jscomb.typing import Image, Mask, Scalar
+from jscomb.typing import Image, Mask
 
 SubAverages = Float[Array, "b h w c"]
-Samples = Scalar | float | int
+Samples = Real[Array, ""] | float | int
 
 
 class Pairs(NamedTuple):
@@ -62,8 +62,8 @@ def make_pairs(
     """
     for name, images in (("independent", independent), ("correlated", correlated)):
         if images.ndim != 4 or images.shape[0] != (count or images.shape[0] or 1):
-            wanted = f"{count} sub-averages, shape [{count or 'B'},H,W,C]"
-            raise ValueError(f"{name} must be {wanted}; got {images.shape}")
+            wanted = f"{count or ''} sub-averages, shape [{count or 'B'},H,W,C]"
+            raise ValueError(f"{name} must be {wanted.strip()}; got {images.shape}")
     check_same_shape(independent=independent[0], correlated=correlated[0])
     if independent.shape != correlated.shape:
         raise ValueError(

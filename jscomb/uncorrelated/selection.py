@@ -15,6 +15,7 @@ from jscomb.numerics.tiles import Grid, Planes, Region, fold_rows, sum_over_tile
 from jscomb.numerics.windows import check_window, window_mean, window_sum
 from jscomb.typing import Image, Scalar
 from jscomb.uncorrelated.combination import combine
+from jscomb.uncorrelated.kernels import rate_of
 from jscomb.uncorrelated.pairs import (
     Samples,
     SubAverages,
@@ -141,37 +142,36 @@ def relative_variances(
         raise ValueError(f"multiples must be whole and positive, got {multiples}")
     a, b = pairs.some(slice(0, None, 2)), pairs.some(slice(1, None, 2))
     guides = [of.z[0] - of.z[1] for of in ((b, a) if crosswise else (a, b))]
-    rate = jnp.asarray(unit * samples, pairs.y.dtype)
+    rate = rate_of(unit, samples, pairs.y.dtype)
     valid = pairs.valid.astype(rate.dtype)
     level = jnp.square(window_mean(pairs.mean, window, mask=pairs.valid))
     weight = valid / (level + jnp.asarray(epsilon, rate.dtype))
     others = window_sum(valid, window) - 1
     share = divide(valid, others, where=others > 0)
-    squares = _squares(
-        # Both halves' planes side by side, so that one sum gives their difference.
-        [jnp.concatenate([a.excess, -b.excess], -1), jnp.concatenate(guides, -1)],
-        [valid, a.mean - b.mean, share, weight],
-        rate,
-        multiples,
-        window=window,
-        stride=stride,
-    )
+    # Both halves' channels side by side, so that one sum gives their difference.
+    excess = jnp.concatenate([a.excess, -b.excess], -1)
+    near = [excess, jnp.concatenate(guides, -1), valid]
+    here = [a.mean - b.mean, share, weight]
+    squares = _squares(near, here, rate, multiples, window=window, stride=stride)
     count = pairs.y.shape[-1] * jnp.maximum(jnp.sum(valid[::stride]), 1)
     return jnp.sum(squares, axis=(1, 2)) / count
 
 
 def _squares(
-    wide: list[Image],
-    narrow: list[Image],
+    near: Sequence[Array],
+    here: Sequence[Array],
     rate: Scalar,
     multiples: Sequence[int],
     *,
     window: int,
     stride: int,
 ) -> Planes:
-    """Per pixel, weight (u^a - u^b)^2 summed over channels, for each multiple."""
+    """Per pixel, weight (u^a - u^b)^2 summed over channels, for each multiple.
+
+    Of images that are seen all over the windows, and others at their centres.
+    """
     reach = check_window(window) // 2
-    size = max(narrow[0].shape[:2])
+    size = max(here[0].shape[:2])
     tile = stride * -(-min(_TILE, size) // stride)
     rows, columns = slice(reach, reach + tile, stride), slice(reach, reach + tile)
 
@@ -216,9 +216,11 @@ def _squares(
         between = (0, 0, 0), (0, stride - 1, stride - 1), (0, 0, 0)
         return lax.pad(found, jnp.zeros((), found.dtype), between)
 
-    regions = [Region(jnp.moveaxis(image, -1, 0), reach) for image in wide]
-    regions.append(Region(jnp.moveaxis(narrow[0], -1, 0), reach))
-    regions += [Region(jnp.moveaxis(image, -1, 0), 0) for image in narrow[1:]]
+    regions = [
+        Region(jnp.moveaxis(image, -1, 0), around)
+        for images, around in ((near, reach), (here, 0))
+        for image in images
+    ]
     return sum_over_tiles(squares, regions, Grid(tile, 1, reach, _TILES), reach=0)
 
 
