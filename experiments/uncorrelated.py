@@ -35,7 +35,6 @@ from jscomb.numerics.poisson import reconstruct
 from jscomb.typing import Image
 
 SAMPLES = 64, 256  # of each kind
-WINDOWS = 7, 11, 15, 21
 COMMON_SEED = 1_000_000
 _EXPONENTIALS = 256, 64 * 64 * 3  # turns, and numbers in cache
 
@@ -50,7 +49,8 @@ class Config:
         out: folder for the frames and the results.
         repeats: timed calls of each function.
         size: side of the image that is timed.
-        quick: only the first scene, with few samples.
+        windows: widths in pixels.
+        quick: only the first scene, with few samples, and the first window.
     """
 
     scenes: tyro.conf.Positional[pathlib.Path]
@@ -58,6 +58,7 @@ class Config:
     out: tyro.conf.Positional[pathlib.Path]
     repeats: int = 5
     size: int = 512
+    windows: tuple[int, ...] = (7, 11, 15, 21)
     quick: bool = False
 
 
@@ -106,7 +107,12 @@ def with_gradients(independent: Image, correlated: Image) -> Image:
     return reconstruct(independent, *differences)
 
 
-def measure(independent: Frame, correlated: Frame, reference: Reference) -> dict:
+def measure(
+    independent: Frame,
+    correlated: Frame,
+    reference: Reference,
+    windows: tuple[int, ...],
+) -> dict:
     """Errors of all methods, and every gamma."""
     scale = 1 / independent.exposure
     every, z_frame = (f.scaled(scale) for f in (independent, correlated))
@@ -126,7 +132,7 @@ def measure(independent: Frame, correlated: Frame, reference: Reference) -> dict
     images["crosswise"] = jax.jit(uncorrelated.combine_crosswise)(
         y, z, gammas["crosswise"], n
     )
-    for window in WINDOWS:
+    for window in windows:
         name = f"uncorrelated {window}x{window}"
         found = uncorrelated.combine_frames(y_frame, z_frame, window=window)
         images[name], gammas[name] = found.image, found.gamma
@@ -154,7 +160,9 @@ def measure(independent: Frame, correlated: Frame, reference: Reference) -> dict
     }
 
 
-def speed(size: int, repeats: int) -> dict[str, dict[str, float]]:
+def speed(
+    size: int, windows: tuple[int, ...], repeats: int
+) -> dict[str, dict[str, float]]:
     """Seconds of each window's parts, and of the exponentials they need at least."""
     keys = jax.random.split(jax.random.key(0), 3)
     y, z = (jax.random.normal(key, (4, size, size, 3)) for key in keys[:2])
@@ -170,7 +178,7 @@ def speed(size: int, repeats: int) -> dict[str, dict[str, float]]:
     combine = jax.jit(uncorrelated.combine, static_argnames="window")
     select = jax.jit(uncorrelated.select_gamma, static_argnames=("window", "stride"))
     uniform = jax.jit(uncorrelated.combine_uniform, static_argnames="window")
-    for w in WINDOWS:
+    for w in windows:
         of = functools.partial
         calls[f"{w} uniform"] = of(uniform, y[:2], z[:2], window=w)
         calls[f"{w} combine"] = of(combine, y[:2], z[:2], 1.0, 8.0, window=w)
@@ -210,8 +218,9 @@ def run(config: Config) -> dict:
     kept = config.out / "results.json"
     found = json.loads(kept.read_text()) if kept.exists() else {}
     todo = [(path, samples) for samples in SAMPLES for path in paths]
+    windows = config.windows
     if config.quick:
-        todo = [(paths[0], 8)]
+        todo, windows = [(paths[0], 8)], windows[:1]
     for path, samples in tqdm(todo, unit="frame"):
         name = f"{path.parent.name} {samples}"
         if name in found:
@@ -221,10 +230,10 @@ def run(config: Config) -> dict:
         reference = Reference(*map(jnp.asarray, both))
         size = reference.image.shape[:2]
         frames = frame_pair(str(path), samples, size, config.out)
-        found[name] = measure(*frames, reference)
+        found[name] = measure(*frames, reference, windows)
         kept.write_text(json.dumps(found, indent=1))
     size, repeats = (64, 1) if config.quick else (config.size, config.repeats)
-    return {"frames": found, "speed": speed(size, repeats)}
+    return {"frames": found, "speed": speed(size, windows, repeats)}
 
 
 def main() -> None:

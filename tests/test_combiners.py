@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import ensemble, james_stein, progressive
+from jscomb import ensemble, james_stein, progressive, uncorrelated
 from jscomb.cli import METHODS
 from jscomb.denoisers import smoothing
 
@@ -20,6 +20,13 @@ def ensemble_of(x, y, v, **options):
     bases = lambda sign: jnp.stack([x + sign * noise, y, smoothing.box(y, window=3)])
     halves = bases(1), bases(-1), x + noise, x - noise
     return ensemble.combine(bases(0), *halves, **options)
+
+
+def uncorrelated_of(x, y, v):
+    """Of x as the independent and y as the correlated estimates; their halves apart."""
+    away = 1e-2 * jnp.stack([x - y, y - x])
+    gamma = 1 / v[0, 0, 0]  # far from all that is done to the frame
+    return uncorrelated.combine(x[None] + away, y[None] + away, gamma, 1)
 
 
 COMBINERS = {
@@ -35,6 +42,7 @@ COMBINERS = {
     "ensemble multi-scale": lambda x, y, v: ensemble_of(
         x, y, v, solver="multi-scale", windows=(7, 11)
     ),
+    "uncorrelated": uncorrelated_of,
     "progressive": lambda x, y, v: progressive.combine(x, y, v, v / 2),
     **{f"command, {name}": method for name, method in METHODS.items()},
 }
