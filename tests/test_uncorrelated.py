@@ -347,6 +347,18 @@ def test_variances_of_hard_cases(name):
     assert (found == 0).all() == (name in ("no noise", "all alike", "all nan"))
 
 
+def test_memory_is_that_of_images():
+    """Not of windows, which have 225 pixels: values, gradients and all candidates."""
+    total = lambda y, z: jnp.sum(uncorrelated.combine(y, z, 1.0, 8))
+    select = lambda y, z: uncorrelated.relative_variances(y, z, 8)
+    size = 256
+    for count, function in ((2, total), (2, jax.grad(total)), (4, select)):
+        shape = jax.ShapeDtypeStruct((count, size, size, 3), jnp.float32)
+        compiled = jax.jit(function).lower(shape, shape).compile()
+        memory = compiled.memory_analysis().temp_size_in_bytes
+        assert memory < 25 * size**2 * 3 * 4
+
+
 def test_vmap():
     y, z = estimates((6, 7))
     two = jnp.stack([y, 2 * y[::-1]]), jnp.stack([z, 2 * z[::-1]])
