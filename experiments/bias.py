@@ -357,7 +357,7 @@ def _picture(path: pathlib.Path, found: dict[str, dict]) -> None:
         row[0].set_ylabel(name, fontsize=8)
     note = "relative bias, blue -10 % to red 10 %; above: its mean square"
     figure.supxlabel(note, fontsize=9)
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=60)
     plt.close(figure)
 
 
