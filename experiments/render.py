@@ -203,13 +203,16 @@ def render(config: Config) -> dict[str, Moments]:
 
 
 def steps(
-    config: Config, todo: Sequence[Pass] | None = None
+    config: Config,
+    todo: Sequence[Pass] | None = None,
+    launch: Callable[[Pass], np.ndarray] | None = None,
 ) -> Iterator[tuple[int, dict[str, Moments]]]:
     """Run all passes, or those that an interrupted run has left.
 
     Args:
         config: what to render.
         todo: the passes in their order; None for `passes(config)`.
+        launch: renders a pass; None for `launcher(config)`.
 
     Yields:
         after each pass (and first what an interrupted run has left, if anything) how
@@ -220,7 +223,7 @@ def steps(
         ValueError: if the scene is unknown, or the partial file on disk belongs to
             another configuration.
     """
-    launch = launcher(config)
+    launch = launch or launcher(config)
     partial = _Partial(config)
     done, moments = partial.load()
     todo = list(passes(config)) if todo is None else todo
@@ -369,7 +372,19 @@ def run(config: Config) -> Frame:
     Returns:
         the frame that was written.
     """
-    frame = assemble(config, render(config))
+    return write(config, assemble(config, render(config)))
+
+
+def write(config: Config, frame: Frame) -> Frame:
+    """Denoise a frame, write it, and forget the partial work.
+
+    Args:
+        config: what was rendered.
+        frame: what came of it.
+
+    Returns:
+        the frame that was written.
+    """
     if config.denoise and oidn.available():
         frame = frame.with_biased("oidn", oidn.denoise_frame(frame))
     provenance = {

@@ -9,6 +9,7 @@ Each paper is one module of pure functions, and each has the verb `combine`::
 """
 
 from jscomb import denoisers as denoisers
+from jscomb import double_shrinkage as double_shrinkage
 from jscomb import ensemble as ensemble
 from jscomb import exr as exr
 from jscomb import features as features

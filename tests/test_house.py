@@ -23,6 +23,7 @@ ROOMS = [
     "ensemble",
     "progressive",
     "uncorrelated",
+    "double_shrinkage",
     "denoisers",
     "exr",
     "plots",
@@ -30,7 +31,13 @@ ROOMS = [
     "__main__",
     "jscomb",
 ]
-COMBINERS = {"james_stein", "ensemble", "progressive", "uncorrelated"}
+COMBINERS = {
+    "james_stein",
+    "ensemble",
+    "progressive",
+    "uncorrelated",
+    "double_shrinkage",
+}
 ROOT = pathlib.Path(__file__).parents[1]
 MODULES = [
     importlib.import_module(m.name)

@@ -65,6 +65,36 @@ def gaussian_weights(
     return Weights(jnp.concatenate([guide, h], axis=-1), _gaussian_of_both)
 
 
+def noise_free_weights(
+    guide: Float[Array, "h w g"],
+    variance: Float[Array, "h w 1"],
+    *,
+    epsilon: float,
+) -> Weights:
+    """Weights exp(-(|g_i - g_c|^2 - v_i - v_c) / (v_i + v_c + eps)).
+
+    As Gaussian ones, but less what noise alone makes of the distance: in a mean over
+    windows, pixels of more noise are worth up to e times as much.
+
+    Args:
+        guide: g, shape [H,W,G].
+        variance: v of the guide, its unit squared, at least zero, shape [H,W,1].
+        epsilon: > 0, in the same unit.
+
+    Returns:
+        the weights.
+
+    Source: DSC eq. 17.
+    """
+    kernel = gaussian_weights(guide, 2 * variance + epsilon)
+
+    def function(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
+        sum_of_both = _mean_of_both(planes[-1:], grid)
+        return kernel.function(planes, grid) * jnp.exp(1 - epsilon / sum_of_both)
+
+    return kernel._replace(function=function)
+
+
 def feature_weights(
     features: Float[Array, "h w f"], *, strength: float = 0.6, least: float = 1e-3
 ) -> Weights:
@@ -164,10 +194,15 @@ def _gaussian(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
 
 def _gaussian_of_both(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
     """The same with the mean of both pixels' bandwidths, the last plane."""
-    h = jnp.where(planes[-1:] > 0, planes[-1:], 1.0)
-    (near,), (centre,) = flat(h), grid.centres(h)
     square = _square_distance(planes[:-1], grid)
-    return jnp.exp(-2 * square / (near[None] + centre[:, None]))
+    return jnp.exp(-square / _mean_of_both(planes[-1:], grid))
+
+
+def _mean_of_both(plane: Planes, grid: Grid) -> Float[Array, "m n"]:
+    """Mean of each centre's and each pixel's value, [1,n,n]; positive."""
+    positive = jnp.where(plane > 0, plane, 1.0)
+    (near,), (centre,) = flat(positive), grid.centres(positive)
+    return (near[None] + centre[:, None]) / 2
 
 
 def _of_features(planes: Planes, grid: Grid) -> Float[Array, "m n"]:

@@ -1,0 +1,76 @@
+"""The radiance prior: regression of two integrators at once."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.numerics.guards import check_same_shape
+from jscomb.numerics.regression import joint_local_linear
+from jscomb.numerics.weights import gaussian_weights, noise_free_weights
+from jscomb.typing import Image
+
+_EPSILON = 0.01  # eps_1, squared radiance, at an exposure of one
+_RIDGE = 0.1
+
+
+def radiance_prior(
+    unbiased: Image,
+    biased: Image,
+    variance: Float[Array, "h w 1"],
+    mse: Float[Array, "h w 1"],
+    features: Float[Array, "h w f"],
+    *,
+    window: int = 51,
+    stride: int = 1,
+    epsilon: float = _EPSILON,
+    ridge: Float[Array, " f"] | float = _RIDGE,
+) -> Image:
+    """A smooth image that both integrators and the features agree on.
+
+    In each window one linear model of the features is fitted to both images. A pixel's
+    weight for one image is what the other image tells of its likeness, so that it does
+    not depend on the noise it weighs. Pure, and differentiable in every array.
+
+    Args:
+        unbiased: u, at an exposure of one, shape [H,W,C].
+        biased: b, likewise.
+        variance: v, of u, mean over channels, at least zero, shape [H,W,1].
+        mse: m, mean squared error of b, mean over channels, at least zero, shape
+            [H,W,1].
+        features: of a range of about one, shape [H,W,F]; F may be 0.
+        window: width of the windows in pixels, odd.
+        stride: pixels between the centres of windows.
+        epsilon: > 0, squared radiance; what keeps a window open where there is no
+            noise.
+        ridge: > 0, one number or one a feature, shape [F].
+
+    Returns:
+        p, shape [H,W,C]. Pixels that are not finite in some input take no part; there,
+        and where no window reaches, it is the mean of u and b if that is finite, else
+        not finite itself.
+
+    Raises:
+        ValueError: while tracing, if sizes differ, or a width or number is out of
+            range.
+
+    Source: DSC eq. 11-17, with f_i - f_j for the printed f_j - f_i in eq. 17, and a
+    mean where it prints a sum.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased)
+    one = (*unbiased.shape[:2], 1)
+    for name, errors in (("variance", variance), ("mse", mse)):
+        if errors.shape != one:
+            raise ValueError(f"{name} has shape {errors.shape}, expected {one}")
+    if not epsilon > 0:
+        raise ValueError(f"epsilon must be positive, got {epsilon}")
+    # A bandwidth is the mean of both pixels' values: twice for their sum.
+    of_unbiased = gaussian_weights(unbiased, 2 * variance + epsilon)
+    of_biased = gaussian_weights(biased, 2 * mse + epsilon)
+    fit = joint_local_linear(
+        [(unbiased, of_biased), (biased, of_unbiased)],
+        features,
+        predict=noise_free_weights(biased, mse, epsilon=epsilon),
+        window=window,
+        stride=stride,
+        ridge=ridge,
+    )
+    return jnp.where(fit.weight > 0, fit.prediction, (unbiased + biased) / 2)

@@ -1,0 +1,287 @@
+"""Double shrinkage against loops and Bayes, and what it is told of errors."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jscomb import double_shrinkage
+from tests.statistics import assert_mean, assert_mean_below
+
+combine = jax.jit(double_shrinkage.combine)
+
+
+def images(shape=(6, 7, 3), seed=0):
+    """Prior, u, b and their errors, [H,W,C]."""
+    rng = np.random.default_rng(seed)
+    p, u, b = rng.standard_normal((3, *shape)) + 2
+    v, m, eta = rng.random((3, *shape)) + 0.1
+    return tuple(map(jnp.asarray, (p, u, b, v, m, eta)))
+
+
+def test_inverse_variances():
+    """The posterior mean: each of three by the inverse of its error."""
+    p, u, b, v, m, eta = images()
+    expected = (p / eta + u / v + b / m) / (1 / eta + 1 / v + 1 / m)
+    np.testing.assert_allclose(combine(p, u, b, v, m, eta), expected, rtol=1e-12)
+    one = lambda image: image[..., :1]
+    expected = (p / one(eta) + u / v + b / one(m)) / (1 / one(eta) + 1 / v + 1 / one(m))
+    found = combine(p, u, b, v, one(m), one(eta))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_posterior_mean_in_the_gaussian_model():
+    """Truth and bias drawn from their priors: no other share of any has less error."""
+    trials, v, gamma2, sb2, eta = 200_000, 0.7, 0.4, 0.2, 0.5
+    keys = jax.random.split(jax.random.key(0), 4)
+    g = [jax.random.normal(k, (trials, 1, 1)) for k in keys]
+    truth = 1 + eta**0.5 * g[0]
+    u = truth + v**0.5 * g[1]
+    b = truth + gamma2**0.5 * g[2] + sb2**0.5 * g[3]
+    at = lambda value: jnp.full_like(truth, value)
+    m = sb2 + gamma2
+    x = combine(at(1.0), u, b, at(v), at(m), at(eta))
+    error = np.ravel(x - truth)
+    expected = 1 / (1 / v + 1 / m + 1 / eta)
+    assert_mean(error**2, expected)
+    assert_mean(error, 0.0)
+    for other in (u, b, at(1.0)):  # a step towards any of them is a step too far
+        assert_mean(error * np.ravel(other - x), 0.0)
+    worse = combine(at(1.0), u, b, at(2 * v), at(m / 2), at(eta))
+    assert_mean_below(error**2 - np.ravel(worse - truth) ** 2, 0.0)
+
+
+def test_limits():
+    p, u, b, v, m, eta = images()
+    none, endless = jnp.zeros_like(v), jnp.full_like(v, jnp.inf)
+    np.testing.assert_allclose(combine(p, u, b, v, m, none), p, rtol=1e-15)
+    blend = (u / v + b / m) / (1 / v + 1 / m)
+    np.testing.assert_allclose(combine(p, u, b, v, m, endless), blend, rtol=1e-12)
+    np.testing.assert_allclose(combine(p, u, b, v, m, 1e20 * eta), blend, rtol=1e-12)
+    np.testing.assert_array_equal(combine(p, u, b, none, m, eta), u)
+    np.testing.assert_array_equal(combine(p, u, b, v, none, eta), b)
+    np.testing.assert_array_equal(combine(p, u, b, none, none, none), u)
+
+
+def test_factors():
+    _, _, _, v, m, eta = images()
+    found = double_shrinkage.factors(v, m, eta)
+    np.testing.assert_allclose(found.biased, v / (v + m), rtol=1e-12)
+    s = v * m / (v + m)
+    np.testing.assert_allclose(found.error, s, rtol=1e-12)
+    paper = v * m / (v * m + eta * (v + m))
+    np.testing.assert_allclose(found.prior, paper, rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e6])
+def test_scale_equivariant_in_float32(scale):
+    given = tuple(i.astype(jnp.float32) for i in images())
+    s = jnp.float32(scale)
+    scaled = [i * s for i in given[:3]] + [i * s * s for i in given[3:]]
+    np.testing.assert_allclose(combine(*scaled), s * combine(*given), rtol=2e-6)
+
+
+def test_gradients():
+    given = images((2, 3, 1))
+    check_grads(combine, given, order=1, modes=["fwd", "rev"], rtol=1e-6)
+    total = lambda *given: jnp.sum(combine(*given))
+    gradient = jax.jit(jax.grad(total, argnums=range(6)))
+    p, u, b, v, m, eta = given
+    for zero in (
+        (0 * v, m, eta),
+        (v, 0 * m, eta),
+        (0 * v, 0 * m, 0 * eta),
+        (v, m, 0 * eta),
+        (v, m, eta + jnp.inf),
+    ):
+        for part in gradient(p, u, b, *zero):
+            assert np.isfinite(part).all()
+
+
+@pytest.mark.parametrize("which", range(6))
+def test_a_bad_pixel_stays_local(which):
+    given = list(images())
+    clean = combine(*given)
+    given[which] = given[which].at[2, 3, 1].set(jnp.nan)
+    found = combine(*given)
+    away = np.ones((6, 7), bool)
+    away[2, 3] = False
+    np.testing.assert_array_equal(found[away], clean[away])
+    expected = given[1][2, 3] if which == 2 else given[2][2, 3]
+    np.testing.assert_array_equal(found[2, 3], expected)
+    total = lambda *given: jnp.sum(combine(*given))
+    for part in jax.jit(jax.grad(total, argnums=range(6)))(*given):
+        assert np.isfinite(part).all()
+
+
+def test_bad_input(unchecked):
+    p, u, b, v, m, eta = images()
+    with pytest.raises(ValueError, match="mse must be at least zero, its least is -"):
+        double_shrinkage.combine(p, u, b, v, -m, eta)
+    with pytest.raises(ValueError, match=r"mse must have shape .*\(6, 7, 3\): None"):
+        double_shrinkage.combine(p, u, b, v, None, eta)
+    with pytest.raises(ValueError, match=r"variance must have shape .*: \(5, 7, 3\)"):
+        double_shrinkage.combine(p, u, b, v[1:], m, eta)
+    with pytest.raises(ValueError, match=r"prior has shape \(5, 7, 3\), unbiased has"):
+        double_shrinkage.combine(p[1:], u, b, v, m, eta)
+    one = v[..., :1]
+    with pytest.raises(ValueError, match=r"mse has shape \(6, 7, 3\), expected"):
+        double_shrinkage.radiance_prior(u, b, one, m, u)
+    with pytest.raises(ValueError, match="epsilon must be positive"):
+        double_shrinkage.radiance_prior(u, b, one, one, u, epsilon=0.0)
+
+
+def likeness(i, js, image, error, epsilon, less):
+    """Weights of pixels js about i, eq. 12, or eq. 17 less the noise."""
+    both = (error[i] + error[js])[:, 0]
+    square = ((image[i] - image[js]) ** 2).sum(axis=1)
+    return np.exp(-(square - less * both) / (both + epsilon))
+
+
+def prior_oracle(u, b, v, m, f, *, window, epsilon=0.01, ridge=0.1, floor=0.1):
+    """Eq. 11-17 by loops; the constant has no ridge, features are scaled per window."""
+    h, w, c = u.shape
+    r = window // 2
+    flat = [np.asarray(i, np.float64).reshape(h * w, -1) for i in (u, b, v, m, f)]
+    u, b, v, m, f = flat
+    place = np.array(list(np.ndindex(h, w)))
+    near = [
+        np.flatnonzero((abs(place - place[i]) <= r).all(axis=1)) for i in range(h * w)
+    ]
+    total, weight = np.zeros((h * w, c)), np.zeros((h * w, 1))
+    for i, js in enumerate(near):
+        wu, wb = (likeness(i, js, *of, epsilon, 0) for of in ((b, m), (u, v)))
+        d = f[js] - f[i]
+        d = d / (abs(d).max(axis=0, initial=0) + floor)
+        a = np.concatenate([np.ones((len(js), 1)), d], axis=1)
+        normal = (a * (wu + wb)[:, None]).T @ a
+        normal += ridge * np.diag([0.0] + [1.0] * d.shape[1])
+        right = (a * wu[:, None]).T @ u[js] + (a * wb[:, None]).T @ b[js]
+        fit = a @ np.linalg.solve(normal, right)
+        predict = likeness(i, js, b, m, epsilon, 1)
+        total[js] += predict[:, None] * fit
+        weight[js] += predict[:, None]
+    return (total / weight).reshape(h, w, c)
+
+
+def scene(shape=(9, 10), seed=1):
+    """u, b, v, m of one channel, and two features that tell something."""
+    rng, (h, w) = np.random.default_rng(seed), shape
+    f = rng.random((h, w, 2))
+    truth = f @ rng.random((2, 3)) + (np.arange(w) > w // 2)[None, :, None]
+    v, m = 0.05 * rng.random((2, h, w, 1)) + 0.01
+    noise = rng.standard_normal((2, h, w, 3))
+    return tuple(
+        map(
+            jnp.asarray, (truth + v**0.5 * noise[0], truth + m**0.5 * noise[1], v, m, f)
+        )
+    )
+
+
+prior = jax.jit(double_shrinkage.radiance_prior, static_argnames=("window", "stride"))
+
+
+@pytest.mark.parametrize("window", [3, 7])
+def test_prior_is_the_loops(window):
+    given = scene()
+    expected = prior_oracle(*given, window=window)
+    np.testing.assert_allclose(prior(*given, window=window), expected, rtol=1e-9)
+    narrow = (i.astype(jnp.float32) for i in given)
+    np.testing.assert_allclose(prior(*narrow, window=window), expected, rtol=2e-4)
+
+
+def test_prior_without_features_and_in_hard_cases():
+    u, b, v, m, f = scene()
+    none = f[..., :0]
+    found = prior(u, b, v, m, none, window=5)
+    np.testing.assert_allclose(
+        found, prior_oracle(u, b, v, m, none, window=5), rtol=1e-9
+    )
+    total = lambda *given: jnp.sum(prior(*given, window=5))
+    gradient = jax.jit(jax.grad(total, argnums=range(5)))
+    cases = {
+        "no noise": (u, b, 0 * v, 0 * m, f),
+        "alike": (u, u, v, v, f),
+        "firefly": (u.at[4, 4].set(1e6), b, v.at[4, 4].set(1e10), m, f),
+        "nan": (u.at[4, 4, 0].set(jnp.nan), b, v, m, f),
+        "constant features": (u, b, v, m, 0 * f + 1),
+    }
+    for name, given in cases.items():
+        found = prior(*given, window=5)
+        bad = ~np.isfinite(np.asarray(found)).all(axis=-1)
+        assert bad.sum() == (name == "nan"), name
+        for part in gradient(*given):
+            assert np.isfinite(np.where(bad[..., None], 0, part)).all(), name
+    assert prior(*(i[:1, :1] for i in (u, b, v, m, f)), window=5).shape == (1, 1, 3)
+
+
+def test_prior_gradients():
+    given = tuple(i[:4, :4] for i in scene())
+    of = lambda *given: prior(*given, window=3)
+    check_grads(of, given, order=1, modes=["rev"], rtol=1e-5, eps=1e-5)
+
+
+def halves(trials, bias, shape=(5, 6, 1)):
+    """u_a, u_b, b_a, b_b of truth 1, [trials,...]; variance .5 and .3 a half."""
+    keys = jax.random.split(jax.random.key(0), 4)
+    g = [jax.random.normal(k, (trials, *shape)) for k in keys]
+    return [1 + 0.5**0.5 * i for i in g[:2]] + [1 + bias + 0.3**0.5 * i for i in g[2:]]
+
+
+@pytest.mark.parametrize("bias", [0.0, 2.0])
+def test_error_of_halves_is_the_true_one(bias):
+    """Unbiased where the squared bias is far from 0; never below the variance."""
+    trials = 4000
+    of = lambda *h: double_shrinkage.biased_error(*h, window=7)
+    found = jax.jit(jax.vmap(of))(*halves(trials, bias))
+    if bias:
+        assert_mean(found[:, 2, 3, 0], bias**2 + 0.3 / 2)
+    else:
+        assert np.mean(found[:, 2, 3, 0]) < 2 * 0.3 / 2
+    assert np.all(np.asarray(found) > 0)
+
+
+def test_error_of_halves_leaves_bad_pixels_out():
+    ua, ub, ba, bb = (i[0] for i in halves(1, 1.0))
+    bad = double_shrinkage.biased_error(ua.at[2, 2].set(jnp.nan), ub, ba, bb, window=3)
+    clean = double_shrinkage.biased_error(ua, ub, ba, bb, window=3)
+    assert np.isfinite(bad).all()
+    np.testing.assert_array_equal(bad[:, 4:], clean[:, 4:])
+
+
+def test_bias_by_radii():
+    """Of passes whose bias is 3 r^2 beside noise."""
+    rng = np.random.default_rng(0)
+    radii = jnp.asarray(np.linspace(0.5, 0.1, 40))
+    square = np.asarray(radii) ** 2
+    passes = 2 + 3 * square[:, None, None, None] + rng.normal(0, 0.01, (40, 6, 7, 2))
+    weighted = np.mean(passes * square[:, None, None, None], axis=0)
+    given = jnp.asarray(passes.mean(axis=0)), jnp.asarray(weighted)
+    found = double_shrinkage.radius_bias(*given, radii, window=5)
+    np.testing.assert_allclose(found, (3 * square.mean()) ** 2, rtol=0.1)
+    same = double_shrinkage.radius_bias(*given, jnp.ones(40), window=5)
+    np.testing.assert_array_equal(same, 0)
+
+
+@pytest.mark.parametrize("away", [0.0, 1.0])
+def test_confidence_is_the_distance_to_the_truth(away):
+    rng, shape, v, m = np.random.default_rng(0), (60, 60, 1), 0.4, 0.6
+    truth = rng.standard_normal(shape)
+    u = truth + v**0.5 * rng.standard_normal(shape)
+    b = truth + m**0.5 * rng.standard_normal(shape)
+    p = truth + away
+    full = lambda value: jnp.full(shape, value)
+    found = double_shrinkage.confidence(
+        *map(jnp.asarray, (p, u, b)), full(v), full(m), window=31
+    )
+    assert abs(found[30, 30, 0] - away**2) < 0.1
+    assert np.all(np.asarray(found) >= 0)
+
+
+def test_confidence_leaves_bad_pixels_out():
+    p, u, b, v, m, _ = images()
+    bad = double_shrinkage.confidence(p.at[2, 2].set(jnp.nan), u, b, v, m, window=3)
+    clean = double_shrinkage.confidence(p, u, b, v, m, window=3)
+    assert np.isfinite(bad).all()
+    np.testing.assert_array_equal(bad[:, 4:], clean[:, 4:])
