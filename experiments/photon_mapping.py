@@ -382,6 +382,13 @@ def assemble(config: Config, moments: dict[str, render.Moments]) -> Frame:
     return render.assemble(config, moments).with_biased(PHOTONS, image)
 
 
+def render_moments(config: Config) -> dict[str, render.Moments]:
+    """The moments of every target after all passes, see `render.steps`."""
+    todo = [*render.passes(config), *passes(config)]
+    *_, (_, moments) = render.steps(config, todo, launcher(config))
+    return moments
+
+
 def run(config: Config) -> Frame:
     """Render a frame and its photons, and write them.
 
@@ -394,9 +401,7 @@ def run(config: Config) -> Frame:
     Raises:
         ValueError: if the scene or a size is wrong, or Mitsuba's variant.
     """
-    todo = [*render.passes(config), *passes(config)]
-    *_, (_, moments) = render.steps(config, todo, launcher(config))
-    return render.write(config, assemble(config, moments))
+    return render.write(config, assemble(config, render_moments(config)))
 
 
 def main() -> None:

@@ -1,9 +1,10 @@
-"""Scenes to render: three of our own, and any Mitsuba 3 XML file by its path.
+"""Scenes to render: four of our own, and any Mitsuba 3 XML file by its path.
 
 The own scenes grow from `mitsuba.cornell_box()`:
 
     cornell-box     plain: large smooth walls, one light
     cornell-glass   glass sphere, rough metal, a small light, a fine checker texture
+    cornell-caustic the same with a tiny light, whose caustics path tracing hardly finds
     cornell-glossy  glossy floor, textured walls, environment light, no ceiling
 
 Every scene is loaded with what unbiased statistics need, whatever its author chose:
@@ -145,16 +146,25 @@ def _standard_xml(path: pathlib.Path, width: int, height: int, sampler: str) -> 
     return ElementTree.tostring(tree, encoding="unicode")
 
 
-def _cornell_glass(mi) -> dict:
-    """A glass sphere and a brushed metal box under a quarter of the usual light."""
+def _cornell_glass(mi, light: float = 1.0) -> dict:
+    """A glass sphere and a brushed metal box under a quarter of the usual light.
+
+    Args:
+        mi: Mitsuba.
+        light: width of the light, relative; its power stays the same.
+    """
     scene = mi.cornell_box()
     at = mi.ScalarTransform4f()
     for box in ("small-box", "large-box"):
         del scene[box]
     scene["light"]["to_world"] = (
-        at.translate([0, 0.99, 0.01]).rotate([1, 0, 0], 90).scale([0.115, 0.095, 1])
+        at.translate([0, 0.99, 0.01])
+        .rotate([1, 0, 0], 90)
+        .scale([0.115 * light, 0.095 * light, 1])
     )
-    scene["light"]["emitter"]["radiance"]["value"] = [73.5, 55.9, 27.0]
+    scene["light"]["emitter"]["radiance"]["value"] = [
+        channel / light**2 for channel in (73.5, 55.9, 27.0)
+    ]
     scene["floor"]["bsdf"] = {
         "type": "diffuse",
         "reflectance": {
@@ -236,5 +246,6 @@ def _sky(height: int = 64) -> np.ndarray:
 SCENES = {
     "cornell-box": lambda mi: mi.cornell_box(),
     "cornell-glass": _cornell_glass,
+    "cornell-caustic": lambda mi: _cornell_glass(mi, light=0.25),
     "cornell-glossy": _cornell_glossy,
 }

@@ -1,5 +1,6 @@
 """Strict arithmetic for every test: no silent broadcast, promotion or key reuse."""
 
+import os
 import pathlib
 
 import jax
@@ -7,6 +8,7 @@ import jaxtyping
 import matplotlib as mpl
 import pytest
 
+from experiments import scenes
 from jscomb import exr
 
 jax.config.update("jax_enable_x64", True)
@@ -24,6 +26,18 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="module")
+def vectorised():
+    """Mitsuba's LLVM variant, whatever other tests have set."""
+    mi = scenes.mitsuba()
+    if not os.environ.get("DRJIT_LIBLLVM_PATH"):
+        pytest.skip("needs LLVM 16 or newer")
+    before = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    yield mi
+    mi.set_variant(before)
 
 
 @pytest.fixture(scope="session", params=["cornell-glass-64", "cornell-box-64"])

@@ -13,7 +13,6 @@ from experiments import (
     james_stein_error,
     james_stein_speed,
     regression_error,
-    scenes,
     speed_error,
     uncorrelated,
 )
@@ -108,10 +107,8 @@ def test_regression_is_measured(folder, tmp_path):
     assert seconds > 0
 
 
-def test_uncorrelated_kernels_are_measured(tmp_path):
+def test_uncorrelated_kernels_are_measured(tmp_path, vectorised):
     """A scene file is rendered with both kinds of numbers, every method measured."""
-    if scenes.mitsuba().variant().startswith("scalar"):
-        pytest.skip("common random numbers need a vectorised variant")
     (tmp_path / "box").mkdir()
     (tmp_path / "box" / "scene.xml").write_text(BOX)
     reference = np.full((12, 16, 3), 0.7, np.float32)
@@ -148,9 +145,7 @@ def test_bias_is_that_of_known_groups():
     assert np.all(bias.skewness(0 * samples) == 0)
 
 
-def test_bias_of_all_methods(tmp_path):
-    if scenes.mitsuba().variant().startswith("scalar"):
-        pytest.skip("common random numbers need a vectorised variant")
+def test_bias_of_all_methods(tmp_path, vectorised):
     config = bias.Config(tmp_path, quick=True)
     found = bias.run(config)
     assert len(found) == 2
@@ -165,9 +160,7 @@ def test_bias_of_all_methods(tmp_path):
         bias.Config(tmp_path, groups=2)
 
 
-def test_likeness_of_neighbours():
-    if scenes.mitsuba().variant().startswith("scalar"):
-        pytest.skip("common random numbers need a vectorised variant")
+def test_likeness_of_neighbours(vectorised):
     rows = correlation.run(correlation.Config(quick=True))
     alone, common, _ = rows.values()
     assert abs(alone["correlation, median"]) < 0.2 < 0.5 < common["correlation, median"]

@@ -14,14 +14,8 @@ SIZE = 24
 LAMP = 18.387, 13.9873, 6.75357  # radiance in Mitsuba's Cornell box
 
 
-@pytest.fixture(autouse=True)
-def _vectorised():
-    if scenes.mitsuba().variant().startswith("scalar"):
-        pytest.skip("photon mapping needs a vectorised variant")
-
-
 @pytest.fixture
-def config(tmp_path):
+def config(tmp_path, vectorised):
     """A small Cornell box, radii far below what its walls would notice."""
     return photon_mapping.Config(
         "cornell-box",

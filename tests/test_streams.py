@@ -5,17 +5,15 @@ import types
 import numpy as np
 import pytest
 
-from experiments import render, scenes, streams
+from experiments import render, streams
 from tests.statistics import assert_mean
 
 PASSES, SIZE = 64, 64
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory):
+def samples(tmp_path_factory, vectorised):
     """Single samples of the Cornell box's green channel, [passes,H,W] by kind."""
-    if scenes.mitsuba().variant().startswith("scalar"):
-        pytest.skip("common random numbers need a vectorised variant")
 
     def rendered(**options):
         out = tmp_path_factory.mktemp("frames") / "f.exr"

@@ -18,7 +18,7 @@ takes the better of two integrators, the second what noise both have left.
 The prior is windowed regression on features, of u and b together, with weights for each
 made of the other (`radiance_prior`). Without a network the confidence comes from
 `confidence`, and the error of b from halves (`biased_error`) or from passes of unlike
-radii (`radius_bias`).
+radii (`radius_bias`). `combine_frame` does all that.
 
 Source: C. Zhou et al., "DSCombiner: Double Shrinkage for Combining Biased and Unbiased
 Monte Carlo Renderings", 2025 (DSC; eq. numbers above).
@@ -27,6 +27,8 @@ Monte Carlo Renderings", 2025 (DSC; eq. numbers above).
 from jscomb.double_shrinkage.errors import biased_error as biased_error
 from jscomb.double_shrinkage.errors import confidence as confidence
 from jscomb.double_shrinkage.errors import radius_bias as radius_bias
+from jscomb.double_shrinkage.frames import Combined as Combined
+from jscomb.double_shrinkage.frames import combine_frame as combine_frame
 from jscomb.double_shrinkage.prior import radiance_prior as radiance_prior
 from jscomb.double_shrinkage.shrinkage import Factors as Factors
 from jscomb.double_shrinkage.shrinkage import combine as combine

@@ -1,0 +1,110 @@
+"""Double shrinkage of a whole frame."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.double_shrinkage.errors import biased_error, confidence
+from jscomb.double_shrinkage.prior import radiance_prior
+from jscomb.double_shrinkage.shrinkage import combine, factors
+from jscomb.features import select, stack
+from jscomb.frame import Frame
+from jscomb.numerics.variance import robust_variance
+from jscomb.typing import Image, Scalar
+
+_RIDGE = 0.1
+
+
+class Combined(NamedTuple):
+    """What `combine_frame` made.
+
+    Attributes:
+        image: the combination, linear radiance, [H,W,C].
+        prior: linear radiance, [H,W,C].
+        biased_share: k1, [H,W,C].
+        prior_share: k2, how much of the result is the prior's, [H,W,C].
+        mse: m, estimated mean squared error of the biased image, squared radiance,
+            [H,W,C].
+        confidence: eta^2, squared radiance, [H,W,C].
+    """
+
+    image: Image
+    prior: Image
+    biased_share: Image
+    prior_share: Image
+    mse: Image
+    confidence: Image
+
+
+def combine_frame(
+    frame: Frame, name: str, *, window: int = 51, stride: int = 2
+) -> Combined:
+    """Combine a frame with a biased image of another integrator, without a network.
+
+    Errors come from the frame's variance and from the halves of both; features that
+    tell nothing are left out, which depends on values, so it is not for `jit`.
+
+    Args:
+        frame: with sub-buffers, and a biased image that has halves independent of them.
+        name: of the biased image.
+        window: width of the prior's windows in pixels, odd.
+        stride: pixels between their centres.
+
+    Returns:
+        the combination and what it was made of.
+
+    Raises:
+        ValueError: if the frame has no such image, or no halves.
+
+    Source: DSC, with `confidence` and `biased_error` for its network's part.
+    """
+    halves = frame.biased[name].halves if name in frame.biased else None
+    if halves is None:
+        has = [n for n, image in frame.biased.items() if image.halves is not None]
+        raise ValueError(f"no biased image {name!r} with halves; there are {has}")
+    a, b = frame.halves()
+    features = stack(frame)
+    needed = select([features])
+    return _combined(
+        jnp.stack([frame.color, a.color, b.color]),
+        jnp.stack([frame.biased[name].full, *halves]),
+        frame.variance,
+        needed.of(features),
+        jnp.asarray(needed.ridge(_RIDGE), features.dtype),
+        frame.exposure,
+        window=window,
+        stride=stride,
+    )
+
+
+def _in_units(
+    unbiased: Float[Array, "3 h w c"],
+    biased: Float[Array, "3 h w c"],
+    variance: Image,
+    features: Image,
+    ridge: Float[Array, " f"],
+    exposure: Scalar,
+    *,
+    window: int,
+    stride: int,
+) -> Combined:
+    """The same of full images and halves, worked out at an exposure of one."""
+    (u, *u_halves), (b, *b_halves) = (i / exposure for i in (unbiased, biased))
+    v = robust_variance(variance / jnp.square(exposure))
+    m = biased_error(*u_halves, *b_halves)
+    one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
+    p = radiance_prior(
+        u, b, one(v), one(m), features, window=window, stride=stride, ridge=ridge
+    )
+    eta = confidence(p, u, b, v, m)
+    share, square = factors(v, m, eta), jnp.square(exposure)
+    image = exposure * combine(p, u, b, v, m, eta)
+    return Combined(
+        image, exposure * p, share.biased, share.prior, square * m, square * eta
+    )
+
+
+# Called with values, a loop over tiles would be compiled anew each time.
+_combined = jax.jit(_in_units, static_argnames=("window", "stride"))
