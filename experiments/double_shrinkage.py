@@ -62,7 +62,7 @@ class Config:
     scenes: tuple[str, ...] = ("cornell-caustic", "cornell-glass", "cornell-box")
     seconds: float = 16.0
     size: int = 128
-    reference_spp: int = 32768
+    reference_spp: int = 16384
     photons: int = 200_000
     radius: float = 0.0
     quick: bool = False
@@ -123,7 +123,8 @@ def frames(config: Config, scene: str, kept: dict) -> tuple[Frame, Frame, Image]
     with np.load(weighted) as data:
         mean, number = jnp.asarray(data["mean"], jnp.float32), int(data["passes"])
     kept |= {"spp": counts[0], "passes": counts[1]}
-    radii = jnp.asarray([photon_mapping.radius_of(1.0, k) for k in range(number)])
+    radii = [photon_mapping.radius_of(1.0, k) for k in range(number)]
+    radii = jnp.asarray(radii, mean.dtype)
     photons = exr.read_frame(half.out).biased[PHOTONS].full
     bias = double_shrinkage.radius_bias(photons, mean, radii)
     return exr.read_frame(whole.out), exr.read_frame(half.out), bias

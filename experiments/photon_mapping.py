@@ -116,7 +116,7 @@ def launcher(config: Config) -> Callable[[render.Pass], np.ndarray]:
     scene = scenes.load(config.scene, width=width, height=height)
     box = scene.bbox()
     diagonal = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-    mapper = _PhotonMapper(mi, scene, config.photons)
+    mapper = PhotonMapper(mi, scene, config.photons)
     first = config.radius or RADIUS * diagonal
     start = config.seed + 10**8
 
@@ -148,7 +148,7 @@ class Photons(NamedTuple):
     start: object
 
 
-class _PhotonMapper:
+class PhotonMapper:
     """One scene's photons and eye paths; a class, since both share so much."""
 
     def __init__(self, mi, scene, count: int) -> None:
@@ -159,8 +159,10 @@ class _PhotonMapper:
 
     def render(self, seed: int, radius: float) -> np.ndarray:
         """One pass, [H,W,3]."""
-        photons = self._photons(seed, radius)
-        return self._image(seed, radius, photons)
+        stored = None
+        while stored is None:
+            stored = self._traced(seed)
+        return self._image(seed, radius, self._sorted(stored, radius))
 
     def _numbers(self, seed: int, count: int):
         """Independent streams of random numbers, one a lane."""
@@ -169,16 +171,8 @@ class _PhotonMapper:
         state, sequence = mi.sample_tea_32(dr.opaque(mi.UInt32, seed, count), lane)
         return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
-    def _photons(self, seed: int, radius: float) -> Photons:
-        """Trace photons, and sort them; again with more room where it was short."""
-        while True:
-            stored = self._traced(seed)
-            if stored is not None:
-                return self._sorted(stored, radius)
-            self.room *= 2
-
     def _traced(self, seed: int):
-        """All meetings with surfaces as NumPy arrays; None where room was short."""
+        """All meetings with surfaces, NumPy arrays; None, and more room, if short."""
         mi, dr, room = self.mi, self.dr, self.room
         numbers = self._numbers(2 * seed, self.count)
         pair = lambda: mi.Point2f(numbers.next_float32(), numbers.next_float32())
@@ -234,6 +228,7 @@ class _PhotonMapper:
         dr.eval(position, direction, flux, edges, order, used)
         number = int(used[0])
         if number > room:
+            self.room *= 2
             return None
         arrays = position, direction, flux, edges, order
         return [np.array(array)[..., :number] for array in arrays]
@@ -243,8 +238,8 @@ class _PhotonMapper:
         mi = self.mi
         position, direction, power, edges, order = stored
         self.buckets = 1 << max(10, int(position.shape[1]).bit_length())
-        cell = np.floor(position / (2 * radius)).astype(np.int32)
-        bucket = _hash(*cell.astype(np.uint32)) & np.uint32(self.buckets - 1)
+        cell = mi.Vector3u(self._cell(mi.Point3f(position), radius))
+        bucket = np.array(_hash(*cell) & (self.buckets - 1))
         by = np.lexsort((order, bucket))
         start = np.searchsorted(bucket[by], np.arange(self.buckets + 1))
         vectors = (
@@ -258,6 +253,13 @@ class _PhotonMapper:
         return Photons(
             *vectors, mi.UInt32(edges[by]), mi.UInt32(start.astype(np.uint32))
         )
+
+    def _cell(self, position, radius: float):
+        """The cell of a point, two radii wide.
+
+        The only place that rounds: walls often lie where two cells meet.
+        """
+        return self.mi.Vector3i(self.dr.floor(position * (0.5 / radius)))
 
     def _image(self, seed: int, radius: float, photons: Photons) -> np.ndarray:
         """Eye paths, and at their ends direct light and photons."""
@@ -334,9 +336,9 @@ class _PhotonMapper:
         mi, dr = self.mi, self.dr
         total = dr.zeros(mi.Color3f, dr.width(si.p))
         # Of the cells, two radii wide, the eight that the radius reaches.
-        least = dr.floor((si.p - radius) / (2 * radius))
+        least = self._cell(si.p - radius, radius)
         for corner in np.ndindex(2, 2, 2):
-            cell = mi.Vector3i(least) + mi.Vector3i(*corner)
+            cell = least + mi.Vector3i(*corner)
             bucket = _hash(*mi.Vector3u(cell)) & (self.buckets - 1)
             at = dr.gather(mi.UInt32, photons.start, bucket, found)
             end = dr.gather(mi.UInt32, photons.start, bucket + 1, found)
@@ -344,8 +346,9 @@ class _PhotonMapper:
             def add(at, total, end=end, cell=cell):
                 p = dr.gather(mi.Point3f, photons.position, at)
                 # Cells of one bucket are told apart, or photons would count twice.
-                own = mi.Vector3i(dr.floor(p / (2 * radius)))
-                near = dr.all(own == cell) & (dr.squared_norm(p - si.p) < radius**2)
+                near = dr.all(self._cell(p, radius) == cell) & (
+                    dr.squared_norm(p - si.p) < radius**2
+                )
                 length = dr.gather(mi.UInt32, photons.edges, at) + edges
                 near &= length <= scenes.MAX_DEPTH
                 wo = si.to_local(dr.gather(mi.Vector3f, photons.direction, at))

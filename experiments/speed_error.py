@@ -61,18 +61,20 @@ class Config:
 
 def parts(size: int) -> dict[str, Callable]:
     """The regression, and its parts for as many tiles, on random images."""
-    key = jax.random.key(0)
+    keys = iter(jax.random.split(jax.random.key(0), 7))
     shape = lambda channels: (size, size, channels)
-    t, g, f = (jax.random.uniform(key, shape(c)) for c in (CHANNELS, 3, FEATURES))
+    t, g, f = (
+        jax.random.uniform(next(keys), shape(c)) for c in (CHANNELS, 3, FEATURES)
+    )
     grid = regression._grid(WINDOW, 1)
     tiles, batch = grid.tiles(size) ** 2, grid.batch
     n, m = grid.width(grid.reach) ** 2, grid.side**2
-    basis = jax.random.normal(key, (batch, FEATURES + 1, n))
-    target, weights = basis[:, :CHANNELS], jax.random.uniform(key, (batch, m, n))
-    guide = jax.random.uniform(key, (batch, 3, n))
+    basis = jax.random.normal(next(keys), (batch, FEATURES + 1, n))
+    target, weights = basis[:, :CHANNELS], jax.random.uniform(next(keys), (batch, m, n))
+    guide = jax.random.uniform(next(keys), (batch, 3, n))
     inside = grid.inside
     phi = jax.vmap(regression._products)(basis, target)
-    b = jax.random.normal(key, (batch, (FEATURES + 1) * CHANNELS + 1, m))
+    b = jax.random.normal(next(keys), (batch, (FEATURES + 1) * CHANNELS + 1, m))
 
     def repeated(step: Callable, *arrays: jax.Array) -> Callable:
         """As often as there are tiles, in one compiled loop."""

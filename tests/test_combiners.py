@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import ensemble, james_stein, progressive, uncorrelated
+from jscomb import (
+    double_shrinkage,
+    ensemble,
+    james_stein,
+    progressive,
+    uncorrelated,
+)
 from jscomb.cli import METHODS
 from jscomb.denoisers import smoothing
 
@@ -43,6 +49,9 @@ COMBINERS = {
         x, y, v, solver="multi-scale", windows=(7, 11)
     ),
     "uncorrelated": uncorrelated_of,
+    "double_shrinkage": lambda x, y, v: double_shrinkage.combine(
+        0.9 * y, x, y, v, v / 2, v / 3
+    ),
     "progressive": lambda x, y, v: progressive.combine(x, y, v, v / 2),
     **{f"command, {name}": method for name, method in METHODS.items()},
 }

@@ -7,6 +7,8 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import double_shrinkage
+from jscomb.features import stack
+from jscomb.numerics.variance import robust_variance
 from tests.statistics import assert_mean, assert_mean_below
 
 combine = jax.jit(double_shrinkage.combine)
@@ -222,11 +224,15 @@ def test_prior_gradients():
     check_grads(of, given, order=1, modes=["rev"], rtol=1e-5, eps=1e-5)
 
 
+LEVEL = 100.0
+
+
 def halves(trials, bias, shape=(5, 6, 1)):
-    """u_a, u_b, b_a, b_b of truth 1, [trials,...]; variance .5 and .3 a half."""
+    """u_a, u_b, b_a, b_b of truth `LEVEL`; variance .5 and .3 a half, [trials,...]."""
     keys = jax.random.split(jax.random.key(0), 4)
     g = [jax.random.normal(k, (trials, *shape)) for k in keys]
-    return [1 + 0.5**0.5 * i for i in g[:2]] + [1 + bias + 0.3**0.5 * i for i in g[2:]]
+    unbiased = [LEVEL + 0.5**0.5 * i for i in g[:2]]
+    return unbiased + [LEVEL + bias + 0.3**0.5 * i for i in g[2:]]
 
 
 @pytest.mark.parametrize("bias", [0.0, 2.0])
@@ -240,6 +246,51 @@ def test_error_of_halves_is_the_true_one(bias):
     else:
         assert np.mean(found[:, 2, 3, 0]) < 2 * 0.3 / 2
     assert np.all(np.asarray(found) > 0)
+
+
+def test_a_lamp_does_not_decide_for_its_surroundings():
+    """Errors of a tenth of the radiance everywhere, and a pixel 1e4 times as bright."""
+    rng = np.random.default_rng(0)
+    truth = np.ones((31, 31, 1))
+    truth[15, 15] = 1e4
+    noisy = lambda size: jnp.asarray(
+        truth * (1 + size * rng.standard_normal(truth.shape))
+    )
+    given = noisy(0.1), noisy(0.1), noisy(0.2), noisy(0.2)
+    m = double_shrinkage.biased_error(*given, window=15)
+    relative = np.asarray(m / truth**2)
+    assert 0.005 < relative.min() < relative.max() < 0.08  # 0.02 in expectation
+    u, b = (given[0] + given[1]) / 2, (given[2] + given[3]) / 2
+    eta = double_shrinkage.confidence(
+        jnp.asarray(1.3 * truth), u, b, jnp.asarray(0.005 * truth**2), m, window=15
+    )
+    relative = np.asarray(eta / truth**2)
+    assert 0.05 < relative.min() < relative.max() < 0.13  # 0.09 in expectation
+
+
+def test_errors_where_b_is_black():
+    """It knows nothing there; nor do windows that are black as a whole."""
+    u = jnp.full((4, 5, 1), 2.0)
+    for shape in ((4, 5, 1), (1, 1, 1)):
+        b = jnp.ones((4, 5, 1)).at[: shape[0], : shape[1]].set(0.0)
+        m = double_shrinkage.biased_error(u, u, b, b, window=3)
+        np.testing.assert_allclose(m[0, 0], (4 + 4) / 4)
+    eta = double_shrinkage.confidence(0 * u, u, u, 0 * u, 0 * u, window=3)
+    np.testing.assert_allclose(eta, 4 / 2)
+    nothing = double_shrinkage.biased_error(*[0 * u] * 4, window=3)
+    np.testing.assert_array_equal(nothing, 0)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e6])
+def test_errors_are_scale_equivariant(scale):
+    ua, ub, ba, bb = (i[0].astype(jnp.float32) / 100 for i in halves(1, 1.0))
+    s = jnp.float32(scale)
+    m = double_shrinkage.biased_error(ua, ub, ba, bb, window=3)
+    found = double_shrinkage.biased_error(s * ua, s * ub, s * ba, s * bb, window=3)
+    np.testing.assert_allclose(found, s * s * m, rtol=1e-4)
+    of = jax.jit(jax.grad(lambda *g: jnp.sum(double_shrinkage.biased_error(*g))))
+    assert np.isfinite(of(ua, ub, 0 * ba, bb)).all()
+    assert np.isfinite(of(*[0 * ua] * 4)).all()
 
 
 def test_error_of_halves_leaves_bad_pixels_out():
@@ -267,7 +318,7 @@ def test_bias_by_radii():
 @pytest.mark.parametrize("away", [0.0, 1.0])
 def test_confidence_is_the_distance_to_the_truth(away):
     rng, shape, v, m = np.random.default_rng(0), (60, 60, 1), 0.4, 0.6
-    truth = rng.standard_normal(shape)
+    truth = LEVEL + rng.standard_normal(shape)
     u = truth + v**0.5 * rng.standard_normal(shape)
     b = truth + m**0.5 * rng.standard_normal(shape)
     p = truth + away
@@ -285,3 +336,35 @@ def test_confidence_leaves_bad_pixels_out():
     clean = double_shrinkage.confidence(p, u, b, v, m, window=3)
     assert np.isfinite(bad).all()
     np.testing.assert_array_equal(bad[:, 4:], clean[:, 4:])
+
+
+def test_a_frame_is_made_of_the_parts(glass_frame):
+    """At an exposure of one, features without those that tell nothing."""
+    frame = glass_frame._replace(reference=None)
+    found = double_shrinkage.combine_frame(frame, "oidn", window=9, stride=1)
+    e = frame.exposure
+    a, b = frame.halves()
+    u, y = frame.color / e, frame.biased["oidn"]
+    v = robust_variance(frame.variance / e**2)
+    m = double_shrinkage.biased_error(*(i / e for i in (a.color, b.color, *y.halves)))
+    one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
+    features = stack(frame)
+    p = prior(u, y.full / e, one(v), one(m), features, window=9)
+    eta = double_shrinkage.confidence(p, u, y.full / e, v, m)
+    expected = e * combine(p, u, y.full / e, v, m, eta)
+    np.testing.assert_allclose(found.image, expected, rtol=2e-3, atol=1e-3 * e)
+    np.testing.assert_allclose(found.mse, e**2 * m, rtol=1e-4)
+    assert np.all((found.prior_share >= 0) & (found.prior_share <= 1))
+    bright = double_shrinkage.combine_frame(
+        frame.scaled(1e3), "oidn", window=9, stride=1
+    )
+    np.testing.assert_allclose(bright.image, 1e3 * found.image, rtol=1e-3, atol=e)
+
+
+def test_frames_without_what_it_takes(glass_frame):
+    alone = glass_frame.with_biased("photons", glass_frame.color)
+    for name in ("photons", "caustics"):
+        with pytest.raises(
+            ValueError, match=rf"no biased image '{name}' with halves; "
+        ):
+            double_shrinkage.combine_frame(alone, name)

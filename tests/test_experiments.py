@@ -8,6 +8,8 @@ from experiments import (
     bias,
     bundle,
     correlation,
+    double_shrinkage,
+    double_shrinkage_speed,
     ensemble,
     frames,
     james_stein_error,
@@ -158,6 +160,33 @@ def test_bias_of_all_methods(tmp_path, vectorised):
     assert (tmp_path / "bias.png").stat().st_size > 10_000
     with pytest.raises(ValueError, match="at least 3 groups of 2 realisations"):
         bias.Config(tmp_path, groups=2)
+
+
+def test_double_shrinkage_is_measured(tmp_path, vectorised):
+    """One scene, both integrators, in a second; what was rendered is kept."""
+    config = double_shrinkage.Config(tmp_path, quick=True)
+    (row,) = double_shrinkage.run(config).values()
+    for errors in (row["error"], row["ablations"]):
+        assert np.isfinite(list(errors.values())).all()
+    assert row["ablations"]["double shrinkage"] == row["error"]["double shrinkage"]
+    assert row["mse"]["variance alone"][0] <= row["mse"]["by radii"][0]
+    whole = exr.read_frame(tmp_path / "cornell-caustic-whole.exr")
+    r, noise = whole.reference
+    expected = metrics.rel_l2(
+        *(i / whole.exposure for i in (whole.color, r)),
+        half_difference=noise / whole.exposure,
+    )
+    alone = row["error"]["path tracing alone"]
+    np.testing.assert_allclose(alone, expected, rtol=1e-4)
+    assert (tmp_path / "cornell-caustic.png").stat().st_size > 10_000
+    again = double_shrinkage.run(config)["cornell-caustic"]
+    assert again["error"] == row["error"]
+
+
+def test_double_shrinkage_is_timed():
+    config = double_shrinkage_speed.Config(quick=True)
+    found = double_shrinkage_speed.run(config)
+    assert all(ratio > 0 for ratio in found.values())
 
 
 def test_likeness_of_neighbours(vectorised):

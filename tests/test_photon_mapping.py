@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from experiments import photon_mapping, render, scenes
+from experiments import photon_error, photon_mapping, render, scenes
 from jscomb import exr
 from tests.statistics import assert_mean
 
@@ -82,6 +82,18 @@ def test_neither_buckets_nor_room_matter(config, monkeypatch):
     np.testing.assert_allclose(launch(first), expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("radius", [0.02, 0.05, 0.1, 1 / 3])
+def test_walls_where_cells_meet(config, radius):
+    """At these radii walls, 1 from the middle, are borders of cells: no light lost."""
+    first = photon_mapping.passes(config)[0]
+    images = [
+        photon_mapping.launcher(dataclasses.replace(config, radius=r))(first)
+        for r in (radius, 1.001 * radius)
+    ]
+    means = [image[..., :3].mean(axis=(0, 1)) for image in images]
+    np.testing.assert_allclose(*means, rtol=5e-3)
+
+
 def test_weighted_by_squared_radius(config):
     launch = photon_mapping.launcher(config)
     *_, last = photon_mapping.passes(config)
@@ -100,6 +112,22 @@ def test_a_frame_with_photons(config):
     np.testing.assert_array_equal(photons.full, frame.biased["photons"].full)
     assert read.samples == 4
     assert not list(config.out.parent.glob("*.partial*"))
+
+
+def test_means_are_compared_with_path_tracing(vectorised):
+    """Against known differences, and for a moment with a real scene."""
+    rng = np.random.default_rng(0)
+    traced, photons = 1 + 0.1 * rng.standard_normal((2, 200, 4, 4))
+    same = photon_error.compare(photons, traced)
+    assert abs(same["frame"]) < 5 * same["its error"]
+    assert 0.3 < same["blocks, mean square"] < 3
+    np.testing.assert_allclose(same["its error"], 0.1 * (2 / 3200) ** 0.5, rtol=0.2)
+    off = photon_error.compare(1.1 * photons, traced)
+    assert abs(off["frame"] - 0.1) < 5 * off["its error"]
+    assert off["blocks, mean square"] > 50
+    rows = photon_error.run(photon_error.Config(("cornell-box",), quick=True))
+    (row,) = rows.values()
+    assert abs(row["frame"]) < 0.2
 
 
 def test_bad_configurations(config, monkeypatch):

@@ -1,11 +1,21 @@
-"""How far from the truth the biased image and the prior are, without a reference."""
+"""How far from the truth the biased image and the prior are, without a reference.
+
+Every estimate is noise in a single pixel, and has to be pooled over windows. Errors are
+taken to grow with radiance, or a lamp and its edge would decide for all around them:
+for squared errors e, levels l^2 that they go with, and the size s^2 of all that e is
+made of,
+
+    m_i = l_i^2 sum_j (e_j / s_j^2) / sum_j (l_j^2 / s_j^2).
+
+No pixel counts for much more than one, whatever fireflies it has.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.double_shrinkage.shrinkage import Errors, factors
 from jscomb.numerics.guards import check_same_shape, divide, finite
-from jscomb.numerics.windows import window_mean
+from jscomb.numerics.windows import window_sum
 from jscomb.typing import Image, Scalar
 
 
@@ -21,7 +31,7 @@ def biased_error(
 
     All four are independent of each other, so (b_a - u_a) (b_b - u_b) is an unbiased
     estimate of the squared bias and (b_a - b_b)^2 / 4 of the variance of the mean. Both
-    are noise in a single pixel, and their mean is taken over windows.
+    are pooled relative to the mean square of b_a and b_b.
 
     Args:
         unbiased_a: u_a, linear radiance, shape [H,W,C].
@@ -31,9 +41,9 @@ def biased_error(
         window: width of the windows in pixels, odd.
 
     Returns:
-        m, of the mean of b_a and b_b, squared radiance, at least the variance's share,
-        shape [H,W,C]. Pixels that are not finite take no part; there it is the mean of
-        the others.
+        m, of the mean of b_a and b_b, squared radiance, at least zero, shape [H,W,C].
+        Where b is 0 it knows nothing, and m is the mean square of all four. Pixels that
+        are not finite take no part, and are 0.
 
     Raises:
         ValueError: while tracing, if shapes differ or `window` is even.
@@ -49,9 +59,21 @@ def biased_error(
     check_same_shape(**images)
     valid = finite(*images.values())
     ua, ub, ba, bb = (jnp.where(valid, i, 0.0) for i in images.values())
-    pooled = lambda image: window_mean(image, window, mask=valid)
-    squared_bias = pooled((ba - ua) * (bb - ub))
-    return jnp.maximum(squared_bias, 0.0) + pooled(jnp.square(ba - bb)) / 4
+    level = (jnp.square(ba) + jnp.square(bb)) / 2
+    size = (jnp.square(ua) + jnp.square(ub)) / 4 + level / 2
+    pooled = lambda square: _pooled(square, level, size, window)
+    squared_bias = jnp.maximum(pooled((ba - ua) * (bb - ub)), 0.0)
+    mse = squared_bias + pooled(jnp.square(ba - bb) / 4)
+    return jnp.where(level > 0, mse, size)
+
+
+def _pooled(errors: Image, level: Image, size: Image, window: int) -> Image:
+    """Errors relative to a level, pooled; pixels where `size` is 0 take no part."""
+    total, weight = (
+        window_sum(divide(image, size, where=size > 0), window)
+        for image in (errors, level)
+    )
+    return level * divide(total, weight, where=weight > 0)
 
 
 def radius_bias(
@@ -60,14 +82,16 @@ def radius_bias(
     """Squared bias of a photon-mapped image, from passes of unlike radii.
 
     The bias of density estimation is about proportional to the squared radius. So the
-    slope of the passes' images over it, times its mean, is the bias of their mean.
+    slope of the passes' images over it, times its mean, is the bias of their mean. The
+    slope is pooled relative to the mean image; with few passes, or radii that hardly
+    differ, it is noise all the same, and its square too large.
 
     Args:
         mean: mean of the passes' images, linear radiance, shape [H,W,C].
         weighted: mean of the passes' images times their squared radius, of any unit,
             shape [H,W,C].
         radii: r of each pass, of the same unit, shape [passes]; not all the same.
-        window: width in pixels that the slope is averaged over, odd.
+        window: width in pixels that the slope is pooled over, odd.
 
     Returns:
         the squared bias, squared radiance, shape [H,W,C]; 0 at pixels that are not
@@ -86,7 +110,8 @@ def radius_bias(
     typical: Scalar = jnp.mean(square)
     spread = jnp.broadcast_to(jnp.var(square), b.shape)
     slope = divide(br - typical * b, spread, where=spread > 0)
-    return jnp.square(typical * window_mean(slope, window, mask=valid))
+    level = jnp.abs(b)
+    return jnp.square(typical * _pooled(slope, level, level, window))
 
 
 def confidence(
@@ -101,7 +126,8 @@ def confidence(
     """How far the truth lies from the prior: empirical Bayes over windows.
 
     The squared distance between the prior and the blend of both integrators is that to
-    the truth and the blend's own error; what exceeds the latter is the prior's.
+    the truth and the blend's own error; what exceeds the latter is the prior's. Pooled
+    relative to the prior's square.
 
     Args:
         prior: p, linear radiance, shape [H,W,C].
@@ -112,8 +138,9 @@ def confidence(
         window: width of the windows in pixels, odd.
 
     Returns:
-        eta^2, squared radiance, at least zero, shape [H,W,C]; pixels that are not
-        finite take no part.
+        eta^2, squared radiance, at least zero, shape [H,W,C]. Where the prior is 0 it
+        is the blend's mean square with it; pixels that are not finite take no part, and
+        are 0.
 
     Raises:
         ValueError: while tracing, if shapes differ or `window` is even.
@@ -128,5 +155,7 @@ def confidence(
     )
     share = factors(v, m, jnp.zeros_like(v))
     blend = share.biased * b + (1 - share.biased) * u
-    excess = jnp.square(blend - p) - share.error
-    return jnp.maximum(window_mean(excess, window, mask=valid), 0.0)
+    excess, level = jnp.square(blend - p) - share.error, jnp.square(p)
+    size = (jnp.square(blend) + level) / 2
+    eta = jnp.maximum(_pooled(excess, level, size, window), 0.0)
+    return jnp.where(level > 0, eta, size)

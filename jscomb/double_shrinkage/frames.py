@@ -83,7 +83,7 @@ def _in_units(
     unbiased: Float[Array, "3 h w c"],
     biased: Float[Array, "3 h w c"],
     variance: Image,
-    features: Image,
+    features: Float[Array, "h w f"],
     ridge: Float[Array, " f"],
     exposure: Scalar,
     *,
