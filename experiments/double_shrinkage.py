@@ -196,14 +196,13 @@ def ablations(half: Frame) -> dict[str, Image]:
         stride=2,
     )
     star = exposure * (halves[0] + halves[1]) / 2
-    eta = double_shrinkage.confidence(star, u, b.full, v, found.mse)
+    w, m = found.variance, found.mse
+    eta = double_shrinkage.confidence(star, u, b.full, w, m)
     return {
         "double shrinkage": found.image,
         "its prior alone": found.prior,
         "y* alone": star,
-        "double shrinkage to y*": double_shrinkage.combine(
-            star, u, b.full, v, found.mse, eta
-        ),
+        "double shrinkage to y*": double_shrinkage.combine(star, u, b.full, w, m, eta),
         "james-stein to y*": _james_stein(u, star, v, **WHITENED),
         "james-stein to the prior": _james_stein(u, found.prior, v, **WHITENED),
     }

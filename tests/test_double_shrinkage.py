@@ -8,7 +8,6 @@ from jax.test_util import check_grads
 
 from jscomb import double_shrinkage
 from jscomb.features import stack
-from jscomb.numerics.variance import robust_variance
 from tests.statistics import assert_mean, assert_mean_below
 
 combine = jax.jit(double_shrinkage.combine)
@@ -268,6 +267,22 @@ def test_a_lamp_does_not_decide_for_its_surroundings():
     assert 0.05 < relative.min() < relative.max() < 0.13  # 0.09 in expectation
 
 
+def test_variance_of_a_pixel_and_its_neighbours():
+    """Half its own, half what goes with its radiance; a firefly keeps its own."""
+    b = jnp.ones((9, 9, 1)).at[4, 4].set(3.0)
+    v = (0.04 * b**2).at[2, 2].set(0.0).at[6, 6].set(1e6)
+    u = b.at[6, 6].set(1e3)
+    found = double_shrinkage.unbiased_error(u, b, v, window=17)
+    pooled = found * 2 - v  # of the whole image, times the square of b
+    np.testing.assert_allclose(pooled, pooled[0, 0, 0] * b**2, rtol=1e-9, atol=1e-8)
+    assert 0.03 < pooled[0, 0, 0] < 0.08
+    np.testing.assert_allclose(found[6, 6, 0], 5e5, rtol=1e-3)
+    bad = double_shrinkage.unbiased_error(u.at[0, 0].set(jnp.nan), b, v, window=3)
+    assert np.isfinite(bad).all()
+    nothing = double_shrinkage.unbiased_error(0 * u, 0 * b, 0 * v, window=3)
+    np.testing.assert_array_equal(nothing, 0)
+
+
 def test_errors_where_b_is_black():
     """It knows nothing there; nor do windows that are black as a whole."""
     u = jnp.full((4, 5, 1), 2.0)
@@ -345,7 +360,7 @@ def test_a_frame_is_made_of_the_parts(glass_frame):
     e = frame.exposure
     a, b = frame.halves()
     u, y = frame.color / e, frame.biased["oidn"]
-    v = robust_variance(frame.variance / e**2)
+    v = double_shrinkage.unbiased_error(u, y.full / e, frame.variance / e**2)
     m = double_shrinkage.biased_error(*(i / e for i in (a.color, b.color, *y.halves)))
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
     features = stack(frame)

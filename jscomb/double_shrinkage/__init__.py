@@ -27,6 +27,7 @@ Monte Carlo Renderings", 2025 (DSC; eq. numbers above).
 from jscomb.double_shrinkage.errors import biased_error as biased_error
 from jscomb.double_shrinkage.errors import confidence as confidence
 from jscomb.double_shrinkage.errors import radius_bias as radius_bias
+from jscomb.double_shrinkage.errors import unbiased_error as unbiased_error
 from jscomb.double_shrinkage.frames import Combined as Combined
 from jscomb.double_shrinkage.frames import combine_frame as combine_frame
 from jscomb.double_shrinkage.prior import radiance_prior as radiance_prior

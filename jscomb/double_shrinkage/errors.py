@@ -19,6 +19,38 @@ from jscomb.numerics.windows import window_sum
 from jscomb.typing import Image, Scalar
 
 
+def unbiased_error(
+    unbiased: Image, biased: Image, variance: Image, *, window: int = 15
+) -> Image:
+    """Variance of the unbiased image that a single pixel can be trusted with.
+
+    A sample variance misses what its samples missed, and that of a neighbourhood knows
+    nothing of a firefly: the mean of both, the latter relative to the biased image's
+    square.
+
+    Args:
+        unbiased: u, linear radiance, shape [H,W,C].
+        biased: b, likewise.
+        variance: sample variance of the mean u, squared radiance, at least zero,
+            likewise.
+        window: width of the windows in pixels, odd.
+
+    Returns:
+        v, squared radiance, shape [H,W,C]. Pixels that are not finite take no part, and
+        are 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+
+    Source: ours; half and half measured best on three scenes.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased, variance=variance)
+    valid = finite(unbiased, biased, variance)
+    u, b, v = (jnp.where(valid, i, 0.0) for i in (unbiased, biased, variance))
+    level = jnp.square(b)
+    return (v + _pooled(v, level, (jnp.square(u) + level) / 2, window)) / 2
+
+
 def biased_error(
     unbiased_a: Image,
     unbiased_b: Image,

@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.double_shrinkage.errors import biased_error, confidence
+from jscomb.double_shrinkage.errors import biased_error, confidence, unbiased_error
 from jscomb.double_shrinkage.prior import radiance_prior
 from jscomb.double_shrinkage.shrinkage import combine, factors
 from jscomb.features import select, stack
 from jscomb.frame import Frame
-from jscomb.numerics.variance import robust_variance
 from jscomb.typing import Image, Scalar
 
 _RIDGE = 0.1
@@ -25,15 +24,16 @@ class Combined(NamedTuple):
         prior: linear radiance, [H,W,C].
         biased_share: k1, [H,W,C].
         prior_share: k2, how much of the result is the prior's, [H,W,C].
-        mse: m, estimated mean squared error of the biased image, squared radiance,
-            [H,W,C].
-        confidence: eta^2, squared radiance, [H,W,C].
+        variance: v, estimated for the unbiased image, squared radiance, [H,W,C].
+        mse: m, estimated mean squared error of the biased image, likewise.
+        confidence: eta^2, likewise.
     """
 
     image: Image
     prior: Image
     biased_share: Image
     prior_share: Image
+    variance: Image
     mse: Image
     confidence: Image
 
@@ -92,7 +92,7 @@ def _in_units(
 ) -> Combined:
     """The same of full images and halves, worked out at an exposure of one."""
     (u, *u_halves), (b, *b_halves) = (i / exposure for i in (unbiased, biased))
-    v = robust_variance(variance / jnp.square(exposure))
+    v = unbiased_error(u, b, variance / jnp.square(exposure))
     m = biased_error(*u_halves, *b_halves)
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
     p = radiance_prior(
@@ -100,9 +100,14 @@ def _in_units(
     )
     eta = confidence(p, u, b, v, m)
     share, square = factors(v, m, eta), jnp.square(exposure)
-    image = exposure * combine(p, u, b, v, m, eta)
     return Combined(
-        image, exposure * p, share.biased, share.prior, square * m, square * eta
+        exposure * combine(p, u, b, v, m, eta),
+        exposure * p,
+        share.biased,
+        share.prior,
+        square * v,
+        square * m,
+        square * eta,
     )
 
 

@@ -18,5 +18,5 @@ from jscomb.james_stein.regression import worth_regressing as worth_regressing
 from jscomb.james_stein.shrinkage import combine as combine
 from jscomb.james_stein.shrinkage import combine_dual as combine_dual
 from jscomb.james_stein.shrinkage import risk as risk
-from jscomb.numerics.variance import robust_variance as robust_variance
-from jscomb.numerics.variance import smooth_variance as smooth_variance
+from jscomb.james_stein.shrinkage import robust_variance as robust_variance
+from jscomb.james_stein.shrinkage import smooth_variance as smooth_variance
