@@ -139,7 +139,9 @@ def methods(whole: Frame, half: Frame) -> dict[str, Callable[[], Image]]:
 
     def blend() -> Image:
         found = made()
-        return found.biased_share * b.full + (1 - found.biased_share) * u
+        nothing = jnp.zeros_like(found.mse)
+        shares = double_shrinkage.factors(found.variance, found.mse, nothing)
+        return shares.blend(u, b.full)
 
     def of_bases() -> Image:
         bases = [
@@ -177,6 +179,7 @@ def methods(whole: Frame, half: Frame) -> dict[str, Callable[[], Image]]:
 
 
 _james_stein = jax.jit(james_stein.combine, static_argnames=("window", "whiten"))
+_prior = jax.jit(double_shrinkage.radiance_prior, static_argnames="stride")
 _ensemble = jax.jit(
     functools.partial(ensemble.combine, solver="multi-scale", filter=False)
 )
@@ -197,12 +200,20 @@ def ablations(half: Frame) -> dict[str, Image]:
     )
     star = exposure * (halves[0] + halves[1]) / 2
     w, m = found.variance, found.mse
-    eta = double_shrinkage.confidence(star, u, b.full, w, m)
+
+    def towards(prior: Image) -> Image:
+        eta = double_shrinkage.confidence(prior, u, b.full, w, m)
+        return double_shrinkage.combine(prior, u, b.full, w, m, eta)
+
+    one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
+    paper = _prior(u, b.full, one(w), one(m), stack(half), stride=2)
     return {
         "double shrinkage": found.image,
         "its prior alone": found.prior,
+        "the paper's prior alone": paper,
+        "double shrinkage to the paper's prior": towards(paper),
         "y* alone": star,
-        "double shrinkage to y*": double_shrinkage.combine(star, u, b.full, w, m, eta),
+        "double shrinkage to y*": towards(star),
         "james-stein to y*": _james_stein(u, star, v, **WHITENED),
         "james-stein to the prior": _james_stein(u, found.prior, v, **WHITENED),
     }

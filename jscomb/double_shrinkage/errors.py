@@ -186,7 +186,7 @@ def confidence(
         for image in (prior, unbiased, biased, variance, mse)
     )
     share = factors(v, m, jnp.zeros_like(v))
-    blend = share.biased * b + (1 - share.biased) * u
+    blend = share.blend(u, b)
     excess, level = jnp.square(blend - p) - share.error, jnp.square(p)
     size = (jnp.square(blend) + level) / 2
     eta = jnp.maximum(_pooled(excess, level, size, window), 0.0)

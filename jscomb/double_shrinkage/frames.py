@@ -58,7 +58,8 @@ def combine_frame(
     Raises:
         ValueError: if the frame has no such image, or no halves.
 
-    Source: DSC, with `confidence` and `biased_error` for its network's part.
+    Source: DSC, with `confidence` and `biased_error` for its network's part, and the
+    prior of the first blend.
     """
     halves = frame.biased[name].halves if name in frame.biased else None
     if halves is None:
@@ -90,13 +91,19 @@ def _in_units(
     window: int,
     stride: int,
 ) -> Combined:
-    """The same of full images and halves, worked out at an exposure of one."""
+    """The same of full images and halves, worked out at an exposure of one.
+
+    The prior is the blend's, in place of both integrators': where one of them fails, in
+    a firefly or in photons' blotches, it fails as a target, whatever its weights.
+    """
     (u, *u_halves), (b, *b_halves) = (i / exposure for i in (unbiased, biased))
     v = unbiased_error(u, b, variance / jnp.square(exposure))
     m = biased_error(*u_halves, *b_halves)
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
+    first = factors(v, m, jnp.zeros_like(v))
+    blend, error = first.blend(u, b), one(first.error)
     p = radiance_prior(
-        u, b, one(v), one(m), features, window=window, stride=stride, ridge=ridge
+        blend, blend, error, error, features, window=window, stride=stride, ridge=ridge
     )
     eta = confidence(p, u, b, v, m)
     share, square = factors(v, m, eta), jnp.square(exposure)

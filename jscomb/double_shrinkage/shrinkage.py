@@ -30,6 +30,10 @@ class Factors(NamedTuple):
     prior: Errors
     error: Errors
 
+    def blend(self, unbiased: Image, biased: Image) -> Image:
+        """x1, of least error without the prior, [H,W,C]."""
+        return self.biased * biased + (1 - self.biased) * unbiased
+
 
 def factors(variance: Errors, mse: Errors, confidence: Errors) -> Factors:
     """The shares of least expected error.
@@ -121,6 +125,5 @@ def combine(
     )
     share = factors(v, m, eta)
     k2 = jnp.where(endless, 0.0, share.prior)
-    first = share.biased * b + (1 - share.biased) * u
-    image = k2 * p + (1 - k2) * first
+    image = k2 * p + (1 - k2) * share.blend(u, b)
     return jnp.where(valid, image, first_finite(biased, unbiased))
