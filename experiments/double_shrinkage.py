@@ -239,7 +239,7 @@ def errors_of_photons(half: Frame, bias: Image) -> dict[str, list[float]]:
         "by radii": bias + variance,
         "variance alone": variance,
     }
-    level = np.mean(r, axis=-1, keepdims=True)
+    level = np.asarray(r).mean(axis=-1, keepdims=True)
     weight = 1 / (level**2 + 0.01 * float(half.exposure) ** 2)
     dark, bright = np.quantile(level, [0.25, 0.75])
     parts = np.ones_like(level), level < dark, level > bright

@@ -33,7 +33,7 @@ from jscomb.frame import Frame, Reference, make_frame
 
 REFERENCE_CHUNK = 16  # samples of one reference pass: bounds memory, saves launches
 TOLD = ("scene", "spp", "buffers", "feature_spp", "reference_spp")
-TOLD += ("seed", "numbers", "tile")
+TOLD += ("seed", "numbers", "tile", "passes", "photons", "radius")
 SAVE_EVERY = 20.0  # seconds between two saves of the work so far
 
 

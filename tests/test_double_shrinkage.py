@@ -8,6 +8,7 @@ from jax.test_util import check_grads
 
 from jscomb import double_shrinkage
 from jscomb.features import stack
+from jscomb.frame import make_frame
 from tests.statistics import assert_mean, assert_mean_below
 
 combine = jax.jit(double_shrinkage.combine)
@@ -385,3 +386,21 @@ def test_frames_without_what_it_takes(glass_frame):
             ValueError, match=rf"no biased image '{name}' with halves; "
         ):
             double_shrinkage.combine_frame(alone, name)
+
+
+def test_ugly_frames(glass_frame):
+    """A bad pixel in either image keeps to itself; features are optional."""
+    color = glass_frame.buffers.color.at[0, 20, 30].set(jnp.nan)
+    photons = glass_frame.biased["oidn"]
+    photons = photons._replace(full=photons.full.at[40, 9].set(jnp.inf))
+    frame = make_frame(
+        color,
+        variance=glass_frame.buffers.variance,
+        samples=64,
+        biased={"photons": photons},
+    )
+    found = double_shrinkage.combine_frame(frame, "photons", window=9, stride=1)
+    assert all(np.isfinite(part).all() for part in found if part is not found.prior)
+    assert np.isfinite(np.delete(found.prior.reshape(-1, 3), (1310, 2569), 0)).all()
+    np.testing.assert_allclose(found.image[20, 30], photons.full[20, 30], rtol=1e-6)
+    np.testing.assert_allclose(found.image[40, 9], frame.color[40, 9], rtol=1e-6)

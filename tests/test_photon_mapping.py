@@ -111,6 +111,8 @@ def test_a_frame_with_photons(config):
     assert not np.array_equal(*photons.halves)
     np.testing.assert_array_equal(photons.full, frame.biased["photons"].full)
     assert read.samples == 4
+    told = exr.read_provenance(config.out)
+    assert (told["photons"], told["passes"], told["radius"]) == (20_000, 4, 0.05)
     assert not list(config.out.parent.glob("*.partial*"))
 
 

@@ -21,7 +21,7 @@ class Combined(NamedTuple):
 
     Attributes:
         image: the combination, linear radiance, [H,W,C].
-        prior: linear radiance, [H,W,C].
+        prior: linear radiance, not finite at invalid pixels, [H,W,C].
         biased_share: k1, [H,W,C].
         prior_share: k2, how much of the result is the prior's, [H,W,C].
         variance: v, estimated for the unbiased image, squared radiance, [H,W,C].
