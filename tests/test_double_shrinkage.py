@@ -193,6 +193,16 @@ def test_prior_is_the_loops(window):
     np.testing.assert_allclose(prior(*narrow, window=window), expected, rtol=2e-4)
 
 
+def test_prior_of_a_blend():
+    """That of both integrators, were they the same; and its gradient."""
+    x1, _, s, _, f = scene()
+    of = lambda x1, s, f: double_shrinkage.blend_prior(x1, s, f, window=5)
+    found = jax.jit(of)(x1, s, f)
+    np.testing.assert_allclose(found, prior(x1, x1, s, s, f, window=5), rtol=1e-9)
+    small = tuple(i[:4, :4] for i in (x1, s, f))
+    check_grads(jax.jit(of), small, order=1, modes=["rev"], rtol=1e-5, eps=1e-5)
+
+
 def test_prior_without_features_and_in_hard_cases():
     u, b, v, m, f = scene()
     none = f[..., :0]

@@ -55,7 +55,7 @@ def test_every_pixel_is_right(samples):
     assert common.mean(axis=(1, 2)).std() > 2 * independent.mean(axis=(1, 2)).std()
 
 
-def test_passes_differ_and_repeat(samples):
+def test_passes_differ(samples):
     common = samples["common"]
     assert not np.array_equal(common[0], common[1])
 

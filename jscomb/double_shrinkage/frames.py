@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.double_shrinkage.errors import biased_error, confidence, unbiased_error
-from jscomb.double_shrinkage.prior import radiance_prior
+from jscomb.double_shrinkage.prior import blend_prior
 from jscomb.double_shrinkage.shrinkage import combine, factors
 from jscomb.features import select, stack
 from jscomb.frame import Frame
 from jscomb.typing import Image, Scalar
 
-_RIDGE = 0.1
+_RIDGE = 0.05
 
 
 class Combined(NamedTuple):
@@ -102,9 +102,7 @@ def _in_units(
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
     first = factors(v, m, jnp.zeros_like(v))
     blend, error = first.blend(u, b), one(first.error)
-    p = radiance_prior(
-        blend, blend, error, error, features, window=window, stride=stride, ridge=ridge
-    )
+    p = blend_prior(blend, error, features, window=window, stride=stride, ridge=ridge)
     eta = confidence(p, u, b, v, m)
     share, square = factors(v, m, eta), jnp.square(exposure)
     return Combined(

@@ -90,6 +90,11 @@ def select_gamma(
         stride=stride,
         crosswise=crosswise,
     )
+    return _best(variances, unit, multiples)
+
+
+def _best(variances: Array, unit: Scalar | float, multiples: Sequence[int]) -> Scalar:
+    """Gamma of the least variance."""
     best = jnp.asarray(multiples, variances.dtype)[jnp.argmin(variances)]
     return best * jnp.asarray(unit, best.dtype)
 
@@ -296,7 +301,6 @@ def _combined(
     y: SubAverages, z: SubAverages, exposure: Scalar, samples: Scalar, *, window: int
 ) -> Combined:
     """Gamma by quarters, then the combination of halves."""
-    multiples = jnp.asarray(MULTIPLES, y.dtype)
     unit = UNIT / jnp.square(exposure)
     variances = relative_variances(
         y,
@@ -306,7 +310,7 @@ def _combined(
         unit=unit,
         epsilon=0.01 * jnp.square(exposure),
     )
-    gamma = unit * multiples[jnp.argmin(variances)]
+    gamma = _best(variances, unit, MULTIPLES)
     y, z = (jnp.stack([mean(images[:2]), mean(images[2:])]) for images in (y, z))
     image = combine(y, z, gamma, samples / 2, window=window)
     return Combined(image, gamma, variances)
