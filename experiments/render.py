@@ -42,7 +42,8 @@ class Config:
     """What to render.
 
     Attributes:
-        scene: cornell-box, cornell-glass, cornell-glossy, or a Mitsuba XML file.
+        scene: cornell-box, cornell-glass, cornell-glossy, random-SEED, or a Mitsuba XML
+            file.
         out: EXR file to write.
         spp: samples a pixel of the full frame.
         size: width and height in pixels; 0 keeps an XML file's own size.
@@ -227,7 +228,9 @@ def steps(
     partial = _Partial(config)
     done, moments = partial.load()
     todo = list(passes(config)) if todo is None else todo
-    progress = tqdm(total=sum(p.spp for p in todo), unit="spp", desc=config.scene)
+    progress = tqdm(
+        total=sum(p.spp for p in todo), unit="spp", desc=config.scene, leave=None
+    )
     progress.update(sum(p.spp for p in todo[:done]))
     if done:
         yield done, moments

@@ -1,4 +1,4 @@
-"""Scenes to render: four of our own, and any Mitsuba 3 XML file by its path.
+"""Scenes to render: four of our own, random ones, and any Mitsuba 3 XML file.
 
 The own scenes grow from `mitsuba.cornell_box()`:
 
@@ -6,6 +6,8 @@ The own scenes grow from `mitsuba.cornell_box()`:
     cornell-glass   glass sphere, rough metal, a small light, a fine checker texture
     cornell-caustic the same with a tiny light, whose caustics path tracing hardly finds
     cornell-glossy  glossy floor, textured walls, environment light, no ceiling
+
+`random-7` is the scene that `random_scenes` draws from the seed 7.
 
 Every scene is loaded with what unbiased statistics need, whatever its author chose:
 a float32 film in linear RGB, a box reconstruction filter (so that pixels are
@@ -19,6 +21,8 @@ import pathlib
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
+
+from experiments import random_scenes
 
 MAX_DEPTH = 12
 LLVM_VERSIONS = range(25, 15, -1)  # 14 and 15 abort the process inside Dr.Jit
@@ -63,7 +67,7 @@ def load(name: str, *, width: int, height: int, sampler: str = "independent"):
     """Load one of the own scenes by name, or a Mitsuba XML file by path.
 
     Args:
-        name: a key of `SCENES`, or the path of an XML file.
+        name: a key of `SCENES`, random-SEED, or the path of an XML file.
         width: of the film in pixels; 0 keeps the file's own (own scenes: 256).
         height: of the film in pixels; 0 likewise.
         sampler: name of a Mitsuba sampler.
@@ -75,8 +79,10 @@ def load(name: str, *, width: int, height: int, sampler: str = "independent"):
         ValueError: if it is neither a known name nor a file; names the choices.
     """
     mi = mitsuba()
-    if name in SCENES:
-        scene = SCENES[name](mi)
+    seed = name.removeprefix("random-")
+    if name in SCENES or (seed != name and seed.isdecimal()):
+        own = SCENES.get(name)
+        scene = own(mi) if own else random_scenes.random_scene(mi, int(seed))
         scene["sensor"] |= {
             "film": _film(width or 256, height or 256),
             "sampler": {"type": sampler},
@@ -85,7 +91,7 @@ def load(name: str, *, width: int, height: int, sampler: str = "independent"):
         return mi.load_dict(scene)
     path = pathlib.Path(name)
     if not path.is_file():
-        known = ", ".join(SCENES)
+        known = ", ".join([*SCENES, "random-SEED"])
         raise ValueError(f"{name!r} is neither a file nor one of the scenes {known}")
     folders = mi.file_resolver()
     # First, and not for longer: scenes call different meshes by the same names.

@@ -15,6 +15,7 @@ from jscomb import exr as exr
 from jscomb import features as features
 from jscomb import frame as frame
 from jscomb import james_stein as james_stein
+from jscomb import learning as learning
 from jscomb import metrics as metrics
 from jscomb import numerics as numerics
 from jscomb import progressive as progressive

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from jscomb.numerics.exposure import exposure
 from jscomb.numerics.guards import finite
 from jscomb.typing import Image, Mask, Scalar, Variance
 
@@ -207,10 +208,7 @@ class Frame(NamedTuple):
         Robust against fireflies and black backgrounds; 1 for a frame that is all
         black. Divide by it (`scaled`) before a method with absolute constants.
         """
-        luminance = jnp.mean(self.color, axis=-1)
-        lit = jnp.isfinite(luminance) & (luminance > 0)
-        median = jnp.nanmedian(jnp.where(lit, luminance, jnp.nan))
-        return jnp.where(jnp.any(lit), median, 1.0)
+        return exposure(self.color)
 
     def scaled(self, factor: Scalar | float) -> "Frame":
         """The frame with all radiance multiplied by `factor`, variances by its square.

@@ -33,6 +33,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
+from jscomb.numerics.exposure import in_units
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
 from jscomb.numerics.windows import (
     at_window_max,
@@ -40,7 +41,7 @@ from jscomb.numerics.windows import (
     separable_sum,
     window_sum,
 )
-from jscomb.typing import Image, Variance
+from jscomb.typing import Image, Scalar, Variance
 
 Mixing = Callable[[Image, Image, Variance, Image], Image]
 
@@ -90,6 +91,50 @@ def combine(
     # As a blend, not x + alpha (y - x), so that 0 and 1 are exact.
     blend = (1 - alpha) * x + alpha * y
     return jnp.where(valid, blend, first_finite(biased, unbiased))
+
+
+def neural_combine(
+    network: Callable[[Image, Image, Variance, Image], Float[Array, "h w 3 c"]],
+    unbiased: Image,
+    biased: Image,
+    variance: Variance,
+    sure: Image,
+    *,
+    bound: bool = True,
+    exposure: Scalar | None = None,
+) -> Image:
+    """Mix a rendering and its denoised image as a network says.
+
+    Pure, scale-equivariant, and differentiable in every array and in the network's
+    parameters.
+
+    Args:
+        network: of x, y, v and s, finite and at an exposure of one, to what
+            `activation` takes, such as `learning.networks.MixingNetwork`.
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, likewise.
+        variance: v of the mean x, squared radiance, at least zero, likewise.
+        sure: s, squared radiance, likewise.
+        bound: take alpha back where it is not consistent with the noise.
+        exposure: what to divide radiance by; None for `numerics.exposure` of x.
+
+    Returns:
+        z, linear radiance, shape [H,W,C]; at an invalid pixel the first finite of
+        (y, x), else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Source: PD eq. 11, 18, 19.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
+    valid = finite(unbiased, biased, variance, sure)
+
+    def mix(x: Image, y: Image, v: Variance, s: Image) -> Image:
+        _, x, y, v, s = in_units(exposure, valid, x, y, variance=v, sure=s)
+        return activation(network(x, y, v, s))
+
+    return combine(unbiased, biased, variance, sure, mix=mix, bound=bound)
 
 
 def mixing(

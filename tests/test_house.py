@@ -25,6 +25,7 @@ ROOMS = [
     "uncorrelated",
     "double_shrinkage",
     "denoisers",
+    "learning",
     "exr",
     "plots",
     "cli",
@@ -84,6 +85,12 @@ def test_imports_flow_one_way(module):
         assert not others & (COMBINERS - {name}), "no combiner imports another"
 
 
+def test_only_the_networks_need_flax():
+    for path in (ROOT / "jscomb").rglob("*.py"):
+        if path.name != "networks.py":
+            assert not re.search(r"^\s*(import|from) flax", path.read_text(), re.M)
+
+
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_signature(function):
     parameters = inspect.signature(function).parameters.values()
@@ -95,7 +102,7 @@ def test_signature(function):
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_docstring_names_every_argument(function):
     doc = inspect.getdoc(function)
-    assert "Returns:" in doc
+    assert "Returns:" in doc or "Yields:" in doc
     for name in inspect.signature(function).parameters:
         assert f"\n    {name}: " in doc, f"{name} is not described"
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jscomb.numerics import windows
+from jscomb.numerics import kernels, windows
 
 SHAPES = [(1, 1, 1), (1, 7, 2), (6, 1, 1), (5, 8, 3), (20, 9, 1)]
 WINDOWS = [1, 3, 5, 7, 15, 21]
@@ -142,7 +142,7 @@ def test_gaussian_mean_matches_loops(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_weighted_mean_matches_loops(shape):
+def test_kernel_mean_matches_loops(shape):
     window, r = 5, 2
     image = images(shape)
     weights = np.random.default_rng(2).random((*shape[:2], window**2))
@@ -155,10 +155,10 @@ def test_weighted_mean_matches_loops(shape):
                 total += weights[y, x, k] * image[v, u, c]
                 weight += weights[y, x, k]
         out[y, x, c] = total / weight
-    result = windows.weighted_mean(jnp.asarray(image), jnp.asarray(weights), window)
+    result = kernels.kernel_mean(jnp.asarray(image), jnp.asarray(weights), window)
     np.testing.assert_allclose(result, out, rtol=1e-10)
     check_grads(
-        jax.jit(lambda i, w: windows.weighted_mean(i, w, window)),
+        jax.jit(lambda i, w: kernels.kernel_mean(i, w, window)),
         (jnp.asarray(image), jnp.asarray(weights)),
         order=1,
         rtol=1e-4,
@@ -233,6 +233,6 @@ def test_rejects_even_and_empty_windows(window):
 def test_rejects_bad_weights():
     image = jnp.ones((3, 4, 1))
     with pytest.raises(ValueError, match=r"weights must have shape \(3, 4, 25\)"):
-        windows.weighted_mean(image, jnp.ones((3, 4, 9)), 5)
+        kernels.kernel_mean(image, jnp.ones((3, 4, 9)), 5)
     with pytest.raises(ValueError, match="sigma must be positive"):
         windows.window_mean(image, 3, sigma=0.0)

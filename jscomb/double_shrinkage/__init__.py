@@ -30,6 +30,8 @@ from jscomb.double_shrinkage.errors import radius_bias as radius_bias
 from jscomb.double_shrinkage.errors import unbiased_error as unbiased_error
 from jscomb.double_shrinkage.frames import Combined as Combined
 from jscomb.double_shrinkage.frames import combine_frame as combine_frame
+from jscomb.double_shrinkage.neural import Filters as Filters
+from jscomb.double_shrinkage.neural import neural_combine as neural_combine
 from jscomb.double_shrinkage.prior import blend_prior as blend_prior
 from jscomb.double_shrinkage.prior import radiance_prior as radiance_prior
 from jscomb.double_shrinkage.shrinkage import Factors as Factors

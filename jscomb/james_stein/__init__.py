@@ -10,6 +10,8 @@ Source:
     Biased Renderings", 2022 (NJS).
 """
 
+from jscomb.james_stein.neural import Parameters as Parameters
+from jscomb.james_stein.neural import neural_combine as neural_combine
 from jscomb.james_stein.regression import Regressed as Regressed
 from jscomb.james_stein.regression import cross_regression as cross_regression
 from jscomb.james_stein.regression import guide_noise as guide_noise

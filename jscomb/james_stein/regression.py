@@ -309,7 +309,13 @@ _worth_regressing = jax.jit(worth_regressing, static_argnames=("window", "stride
 
 
 def regress(
-    key: Key, frame: Frame, name: str, *, window: int = 51, stride: int = 1
+    key: Key,
+    frame: Frame,
+    name: str,
+    *,
+    window: int = 51,
+    stride: int = 1,
+    always: bool = False,
 ) -> Regressed:
     """Regress a frame's biased image where the halves say that it lowers the error.
 
@@ -322,6 +328,7 @@ def regress(
         name: of the biased image.
         window: width of the windows in pixels, odd.
         stride: pixels between the centres of windows.
+        always: regress whatever the halves say; `change` is still what they say.
 
     Returns:
         the new biased image, or the old one, and why.
@@ -346,7 +353,7 @@ def regress(
     change = _worth_regressing(
         key, xa, xb, ya, yb, fa, fb, va, vb, stride=coarse, **options
     )
-    if not change.helps:
+    if not (always or change.helps):
         return Regressed(frame.biased[name], change, ran=False)
     both = _cross_regression(xa, xb, ya, yb, fa, fb, stride=stride, **options)
     halves = exposure * jnp.stack(both)

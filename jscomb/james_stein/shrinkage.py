@@ -45,9 +45,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.numerics.kernels import kernel_mean
 from jscomb.numerics.windows import (
     check_window,
-    weighted_mean,
     window_mean,
     window_sum,
 )
@@ -231,7 +231,7 @@ def smooth_variance(
         return window_mean(variance, window, mask=valid, sigma=sigma)
     if sigma is not None:
         raise ValueError("give sigma or weights, not both")
-    return weighted_mean(variance, weights, window, mask=valid)
+    return kernel_mean(variance, weights, window, mask=valid)
 
 
 def robust_variance(

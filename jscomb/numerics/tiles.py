@@ -183,6 +183,44 @@ def fold_rows(
     return lax.scan(step, (start, list(near)), None, length=window)[0][0]
 
 
+def map_rows(
+    function: Callable[..., Array],
+    images: Sequence[tuple[Float[Array, "h _ _"], int]],
+    *,
+    rows: int = 16,
+) -> Float[Array, "h _ _"]:
+    """Put an image together from strips of rows, one at a time.
+
+    For a function that needs much memory a pixel. Reverse mode works each strip out
+    again rather than remember it.
+
+    Args:
+        function: of strips of all images, [rows + 2 reach, W, C] each, to [rows, W, C];
+            the images' W and C may differ.
+        images: of one height, each with its reach: how many rows around a strip the
+            function sees of it, zero outside the image.
+        rows: of a strip of the result.
+
+    Returns:
+        the strips' results as one image, [H,W,C].
+    """
+    height = images[0][0].shape[0]
+    rows = min(rows, height)
+    count = -(-height // rows)
+
+    def strips(image: Array, reach: int) -> Array:
+        size = rows + 2 * reach
+        total = (count + -(-size // rows)) * rows  # as `_cut` wants
+        ends = [(reach, total - reach - height), (0, 0), (0, 0)]
+        return _cut(jnp.pad(image, ends), rows, size, count, axis=0)
+
+    each = [strips(image, reach) for image, reach in images]
+    if count == 1:
+        return function(*(strip[0] for strip in each))[:height]
+    made = lax.map(jax.checkpoint(lambda strips: function(*strips)), each)
+    return made.reshape(count * rows, *made.shape[2:])[:height]
+
+
 def flat(planes: Planes) -> Float[Array, "k n"]:
     """Planes with their pixels along one axis.
 

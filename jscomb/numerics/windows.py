@@ -12,8 +12,9 @@ doubling (sums over 1, 2, 4, ... pixels, put together by the bits of w), the fas
 form on a CPU; rows by
 `lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
 (two collective permutes, where doubling needs twelve). Extrema double along both axes:
-`reduce_window` is many times slower on a CPU. Gaussian and given weights have no such
-form: sharded by rows they exchange pixels once for every row of the window.
+`reduce_window` is many times slower on a CPU. Gaussian weights have no such form, nor
+have those of `kernels`, which differ from pixel to pixel: sharded by rows they exchange
+pixels once for every row of the window.
 
 A `mask` names the pixels that take part; what the others hold is never looked at, so it
 may be NaN.
@@ -21,7 +22,6 @@ may be NaN.
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -227,57 +227,6 @@ def window_count(
         return np.minimum(at + r, n - 1) - np.maximum(at - r, 0) + 1
 
     return jnp.asarray(np.outer(along(shape[0]), along(shape[1]))[..., None], dtype)
-
-
-def weighted_mean(
-    image: Image,
-    weights: Float[Array, "h w window2"],
-    window: int,
-    *,
-    mask: Mask | None = None,
-) -> Image:
-    """Mean over the window of each pixel with weights of its own.
-
-    Row by row of the window, so that neither the value nor the reverse derivative ever
-    holds the w² shifted copies of the image.
-
-    Args:
-        image: values of any unit, shape [H,W,C].
-        weights: at least zero, shape [H,W,w²], row-major over the offsets
-            (-r, -r) ... (r, r); those that fall outside the image do not count.
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
-
-    Returns:
-        the means, in the unit of `image`, shape [H,W,C]; 0 where the weights of all
-        pixels that take part are 0.
-
-    Raises:
-        ValueError: if `window` is even or less than one, or the weights' shape is not
-            [H,W,w²].
-    """
-    h, w, c = image.shape
-    r = check_window(window) // 2
-    if weights.shape != (h, w, window**2):
-        raise ValueError(
-            f"weights must have shape {(h, w, window**2)} for this image and window, "
-            f"got {weights.shape}"
-        )
-    both = jnp.concatenate([_only(image, mask, 0.0), _ones(image, mask)], axis=-1)
-    padded = jnp.pad(both, ((r, r), (r, r), (0, 0)))
-
-    @jax.checkpoint
-    def add_row(total: Image, row: Array) -> tuple[Image, None]:
-        strip = lax.dynamic_slice_in_dim(padded, row, h, axis=0)
-        share = lax.dynamic_slice_in_dim(weights, row * window, window, axis=2)
-        for column in range(window):
-            near = lax.slice_in_dim(strip, column, column + w, axis=1)
-            total = total + share[..., column : column + 1] * near
-        return total, None
-
-    total, _ = lax.scan(add_row, jnp.zeros_like(both), jnp.arange(window))
-    weight = jnp.broadcast_to(total[..., c:], image.shape)
-    return divide(total[..., :c], weight, where=weight > 0)
 
 
 def check_window(window: int) -> int:

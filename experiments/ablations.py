@@ -1,0 +1,36 @@
+"""Methods with something left out, to be trained like the others."""
+
+import jax
+import jax.numpy as jnp
+
+from jscomb import progressive
+from jscomb.learning import methods
+from jscomb.learning.methods import METHODS
+
+
+def _no_sure(key, frame, name):
+    """PD's inputs with what is known of the error without a derivative."""
+    taken, _ = METHODS["pd"].variants(key, frame, name)
+    x, y, v = (taken[n] for n in ("unbiased", "biased", "variance"))
+    s = jnp.square(x - y) - v
+    exchanged = {"unbiased": y, "biased": x, "variance": s, "sure": v}
+    return [taken | {"sure": s}, exchanged]
+
+
+def _direct(network, inputs, **options):
+    """PD with a sigmoid of one output in place of the form of its equation 9."""
+
+    def outputs(*images):
+        share = jax.nn.sigmoid(network(*images)[:, :, :1])
+        return jnp.concatenate(
+            [share, jnp.zeros_like(share), jnp.ones_like(share)], axis=2
+        )
+
+    return progressive.neural_combine(outputs, **inputs, **options)
+
+
+ABLATIONS: dict[str, methods.Method] = {
+    "pd-no-sure": METHODS["pd"]._replace(variants=_no_sure),
+    "pd-direct": METHODS["pd"]._replace(combine=_direct),
+}
+"""The progressive paper's table 4; its third, without the bound, trains nothing."""

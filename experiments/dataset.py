@@ -1,0 +1,131 @@
+"""Frames to train on: random scenes, each at some sample counts, with a reference.
+
+    python -m experiments.dataset OUT --scenes 100
+
+Every frame is an EXR file by `experiments.render`: two half buffers with variances
+and features, Open Image Denoise of the frame and of its halves, and a reference. The
+sample counts of a scene are drawn from powers of two between 4 and 256 and its frames
+share one reference; their noise is independent of it and of each other. A run that was
+interrupted goes on where it was, and one with more scenes adds to those that are there.
+
+A reference of 1024 samples is itself noisy, which a squared error forgives: with a
+reference r + e, E[e] = 0 and independent of the inputs, the expected loss is that of r
+plus the variance of e, whatever the network puts out, so its gradient is unbiased.
+Not so for absolute errors, nor for the weights that a relative error takes from r: both
+bend it a little, the less the more samples the reference has.
+"""
+
+import dataclasses
+import pathlib
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments import render
+from jscomb.denoisers import oidn
+
+COUNTS = (4, 8, 16, 32, 64, 128, 256)
+STREAMS = 100_000  # apart from each other: seeds of the frames of one scene
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Which frames.
+
+    Attributes:
+        out: folder of the frames.
+        scenes: how many scenes.
+        counts: sample counts of each.
+        size: width and height in pixels.
+        reference_spp: samples a pixel of each scene's reference.
+        seed: of the first scene; the others' follow.
+    """
+
+    out: tyro.conf.Positional[pathlib.Path]
+    scenes: int = 100
+    counts: int = 2
+    size: int = 128
+    reference_spp: int = 1024
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be drawn."""
+        if not 1 <= self.counts <= len(COUNTS):
+            raise ValueError(f"counts must be 1 to {len(COUNTS)}, got {self.counts}")
+        if self.scenes < 1 or self.reference_spp < 1024:
+            raise ValueError(
+                "dataset wants at least one scene and references of at least 1024 "
+                f"samples, got {self.scenes} and {self.reference_spp}"
+            )
+
+
+def renders(config: Config, scene: int) -> Iterator[render.Config]:
+    """What to render of one scene; the first has the reference, the others borrow it.
+
+    Args:
+        config: which frames.
+        scene: seed of the scene.
+
+    Yields:
+        a frame each, by falling sample count.
+    """
+    rng = np.random.default_rng([scene, 0xC0417])
+    counts = sorted(rng.choice(COUNTS, config.counts, replace=False), reverse=True)
+    first = None
+    for number, spp in enumerate(counts):
+        out = config.out / f"random-{scene:05d}-{spp}.exr"
+        yield render.Config(
+            f"random-{scene}",
+            out,
+            spp=int(spp),
+            size=config.size,
+            reference_spp=0 if first else config.reference_spp,
+            reference_from=first,
+            seed=number * STREAMS,
+        )
+        first = first or out
+
+
+def run(config: Config) -> list[pathlib.Path]:
+    """Render the frames that are not there yet.
+
+    Args:
+        config: which frames.
+
+    Returns:
+        all frames' files.
+
+    Raises:
+        ImportError: without Open Image Denoise.
+    """
+    if not oidn.available():
+        raise ImportError('a dataset needs a denoiser: pip install "jscomb[oidn]"')
+    config.out.mkdir(parents=True, exist_ok=True)
+    files, start, made = [], time.monotonic(), 0
+    scenes = range(config.seed, config.seed + config.scenes)
+    for scene in tqdm(scenes, unit="scene", desc="dataset"):
+        for frame in renders(config, scene):
+            if not frame.out.exists():
+                render.run(frame)
+                made += 1
+            files.append(frame.out)
+    megabytes = sum(f.stat().st_size for f in files) / 1e6
+    minutes = (time.monotonic() - start) / 60
+    print(f"{len(files)} frames, {megabytes:.0f} MB; {made} made in {minutes:.1f} min")
+    return files
+
+
+def main() -> None:
+    """Run from the command line."""
+    try:
+        run(tyro.cli(Config, description=__doc__))
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"dataset: {' '.join(str(error).split())}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,196 @@
+"""Do trained networks beat the estimators without, on scenes that they never saw?
+
+    python -m experiments.learned FOLDER --runs RUNS --results FILE.json
+
+Every archive in the folder (see `frames`), at every sample count: relative L2, less the
+reference's noise, of both inputs, of the estimators without a network, and of the
+networks: those that come with the package, or each run of `experiments.train` in RUNS
+by the name of its folder. Then the geometric mean over the frames of the ratio to the
+better of the two inputs, and the worst frame.
+"""
+
+import dataclasses
+import functools
+import json
+import pathlib
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments import frames, train
+from jscomb import double_shrinkage, james_stein, progressive
+from jscomb.cli import METHODS as UNTRAINED
+from jscomb.frame import Frame
+from jscomb.learning import methods
+from jscomb.metrics import rel_l2
+from jscomb.typing import Image
+
+INPUTS = ("path tracing", "oidn")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to measure.
+
+    Attributes:
+        folder: of NumPy archives.
+        runs: folder of runs; None for the shipped networks.
+        results: file that results are kept in as they come.
+        quick: only the first archive, at its least sample count.
+    """
+
+    folder: tyro.conf.Positional[pathlib.Path]
+    runs: pathlib.Path | None = None
+    results: pathlib.Path | None = None
+    quick: bool = False
+
+
+def _errors(images: dict[str, Image], frame: Frame) -> dict[str, float]:
+    """Relative L2 of each."""
+    assert frame.reference is not None
+    r, noise = frame.reference
+    error = lambda image: float(rel_l2(image, r, half_difference=noise))
+    return {name: error(image) for name, image in images.items()}
+
+
+def measure_untrained(frame: Frame) -> dict[str, float]:
+    """Inputs, and combinations without a network."""
+    x, y, v = frame.color, frame.biased["oidn"].full, frame.variance
+    images = {"path tracing": x, "oidn": y}
+    images |= {name: jax.jit(f)(x, y, v) for name, f in UNTRAINED.items()}
+    regressed, _ = _james_stein_inputs(frame)
+    pooled = james_stein.smooth_variance(v)
+    star = (regressed["biased_a"] + regressed["biased_b"]) / 2
+    images["y*"] = star
+    images["james-stein, y*"] = james_stein.combine(x, star, pooled)
+    shrunk = double_shrinkage.combine_frame(frame, "oidn", stride=2)
+    images |= {"double shrinkage": shrunk.image, "its prior": shrunk.prior}
+    (pd, _) = methods.METHODS["pd"].variants(jax.random.key(0), frame, "oidn")
+    mix = functools.partial(progressive.mixing, whiten=True)
+    images["progressive, whitened"] = progressive.combine(**pd, mix=mix)
+    return _errors(images, frame)
+
+
+def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
+    """Regressed and plain, in this order."""
+    key = jax.random.key(0)
+    variants = methods.METHODS["njs"].variants(key, frame, "oidn")
+    plain = lambda inputs: bool(jnp.all(inputs["biased_a"] == inputs["biased_b"]))
+    return sorted(variants, key=plain)
+
+
+def measure_network(
+    frame: Frame, method: str, network: methods.Network
+) -> dict[str, float]:
+    """A network as it is used, and with parts of its method left out."""
+    chosen = train.ALL[method]
+    combine = lambda inputs, **o: chosen.combine(
+        network, inputs, exposure=jnp.ones(()), **o
+    )
+    taken, *_ = chosen.variants(jax.random.key(0), frame, "oidn")
+    images = {"": jax.jit(combine)(taken)}
+    if method == "njs":
+        regressed, plain = map(jax.jit(combine), _james_stein_inputs(frame))
+        images |= {", always regressed": regressed, ", never regressed": plain}
+    if method.startswith("pd"):
+        images[", no bound"] = jax.jit(functools.partial(combine, bound=False))(taken)
+    if method == "kernels-njs":
+        images[", its denoiser"] = methods.DENOISERS["kernels"].combine(
+            network.denoiser, taken
+        )
+    return _errors(images, frame)
+
+
+def networks_of(
+    runs: pathlib.Path | None,
+) -> dict[str, tuple[str, methods.Network]]:
+    """Method and network by name.
+
+    Args:
+        runs: folder of runs; None for the shipped networks.
+
+    Returns:
+        those that are finished.
+    """
+    if runs is None:
+        return {name: (name, methods.shipped(name)) for name in methods.METHODS}
+    found = {}
+    for card in sorted(runs.glob("*/network.json")):
+        about = json.loads(card.read_text())
+        if about["steps"] == about["schedule"]["steps"]:
+            path = card.with_name("network.safetensors")
+            network = methods.load(train.ALL[about["method"]], path)
+            found[card.parent.name] = about["method"], network
+    return found
+
+
+def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
+    """Measure every frame.
+
+    Args:
+        config: what to measure.
+
+    Returns:
+        relative L2 by name, by name of the frame and sample count.
+
+    Raises:
+        ValueError: if the folder holds no archive.
+    """
+    measures: dict[str, Callable[[Frame], dict[str, float]]] = {"": measure_untrained}
+    for name, (method, network) in networks_of(config.runs).items():
+        measures[name] = functools.partial(
+            measure_network, method=method, network=network
+        )
+    found = frames.measured(
+        config.folder, measures, results=config.results, quick=config.quick
+    )
+    rows: dict[tuple[str, int], dict[str, float]] = {}
+    for key, errors in found.items():
+        frame, samples, *kind = key.split(" ")
+        row = rows.setdefault((frame, int(samples)), {})
+        row |= {" ".join(kind) + name: error for name, error in errors.items()}
+    return rows
+
+
+def summary(
+    rows: dict[tuple[str, int], dict[str, float]],
+) -> dict[str, dict[str, float]]:
+    """Ratios to the better input: geometric mean at each sample count, and the worst.
+
+    Args:
+        rows: by `run`.
+
+    Returns:
+        numbers by sample count and "worst", by name.
+    """
+    table: dict[str, dict[str, float]] = {}
+    for name in next(iter(rows.values())):
+        ratios = {
+            key: row[name] / min(row[i] for i in INPUTS) for key, row in rows.items()
+        }
+        column = {}
+        for samples in sorted({s for _, s in rows}):
+            logs = [np.log(r) for (_, s), r in ratios.items() if s == samples]
+            column[str(samples)] = float(np.exp(np.mean(logs)))
+        table[name] = column | {"worst": max(ratios.values())}
+    return table
+
+
+def main() -> None:
+    """Print both tables."""
+    rows = run(tyro.cli(Config, description=__doc__))
+    for name, column in summary(rows).items():
+        numbers = " | ".join(f"{value:.3f}" for value in column.values())
+        print(f"| {name} | {numbers} |")
+    names = list(next(iter(rows.values())))
+    print("| frame | " + " | ".join(names) + " |")
+    for (frame, samples), row in rows.items():
+        print(f"| {frame} {samples} |", end="")
+        print("".join(f" {row[name]:.5f} |" for name in names))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,243 @@
+"""Train one of the networks on a folder of frames.
+
+    python -m experiments.train njs DATASET --out RUN --size light --steps 3000
+
+Frames of one scene in ten are held out for validation. RUN gets the network
+(`network.safetensors` with its card `network.json`), the state to go on from, the
+losses and a plot of them; the same command goes on with a run that was interrupted.
+`--quick` is a minute of it.
+"""
+
+import dataclasses
+import json
+import pathlib
+import sys
+import time
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments.ablations import ABLATIONS
+from jscomb import exr
+from jscomb.learning import files, training
+from jscomb.learning.methods import DENOISERS, METHODS
+
+ALL = METHODS | DENOISERS | ABLATIONS
+QUICK = training.Schedule(steps=30, batch=2, crop=48)
+SAVE_EVERY = 60.0  # seconds
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """A run.
+
+    Attributes:
+        method: whose network: njs, dsc, pd, kernels (a denoiser), kernels-njs (both,
+            jointly), or an ablation: pd-no-sure, pd-direct.
+        data: folder of frames by `experiments.dataset`.
+        out: folder of the run.
+        size: light or full.
+        schedule: how to train.
+        validate: steps between two validations.
+        quick: a short schedule of small crops.
+    """
+
+    method: tyro.conf.Positional[str]
+    data: tyro.conf.Positional[pathlib.Path]
+    out: pathlib.Path
+    size: Literal["light", "full"] = "light"
+    schedule: training.Schedule = training.Schedule()  # noqa: RUF009 (frozen)
+    validate: int = 100
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be trained."""
+        if self.method not in ALL:
+            raise ValueError(f"no method {self.method!r}; there are {', '.join(ALL)}")
+
+
+def scene_of(file: pathlib.Path) -> str:
+    """The scene that a frame shows, from its name less the sample count.
+
+    Args:
+        file: of a frame.
+
+    Returns:
+        the scene.
+    """
+    return file.stem.rpartition("-")[0]
+
+
+def split(data: pathlib.Path) -> tuple[list[pathlib.Path], list[pathlib.Path]]:
+    """Frames to train on and to validate on, of different scenes.
+
+    Args:
+        data: folder of frames.
+
+    Returns:
+        both lists.
+
+    Raises:
+        ValueError: if there are fewer than two scenes.
+    """
+    frames = sorted(data.glob("*.exr"))
+    scenes = sorted({scene_of(file) for file in frames})
+    if len(scenes) < 2:
+        raise ValueError(f"{data} has frames of {len(scenes)} scene(s), wanted two")
+    held = set(scenes[:: min(10, len(scenes))])
+    return (
+        [file for file in frames if scene_of(file) not in held],
+        [file for file in frames if scene_of(file) in held],
+    )
+
+
+def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
+    """The inputs of frames for a method, at an exposure of one.
+
+    Args:
+        method: a key of `ALL`.
+        frames: files with the biased image "oidn" and a reference; black ones are left
+            out.
+
+    Returns:
+        the examples.
+    """
+    inputs, references = [], []
+    for number, file in enumerate(tqdm(frames, unit="frame", desc=f"{method} inputs")):
+        frame = exr.read_frame(file)
+        if frame.reference is None:
+            raise ValueError(f"{file} has no reference")
+        if not float(jnp.median(frame.reference.image)) > 0:
+            continue  # a camera where no light comes
+        variants = ALL[method].variants(jax.random.key(number), frame, "oidn")
+        inputs.append(
+            {name: np.stack([v[name] for v in variants]) for name in variants[0]}
+        )
+        references.append(np.asarray(frame.reference.image / frame.exposure))
+    arrays = {name: np.stack([i[name] for i in inputs]) for name in inputs[0]}
+    return training.Examples(
+        {name: jnp.asarray(a, jnp.float32) for name, a in arrays.items()},
+        jnp.asarray(np.stack(references), jnp.float32),
+    )
+
+
+def objective(method: str) -> training.Objective:
+    """The loss of a method's network on one frame.
+
+    Args:
+        method: a key of `ALL`.
+
+    Returns:
+        of network, inputs, reference and exposure; in units of that exposure.
+    """
+    chosen = ALL[method]
+    # The bound is of the method as it is used: it needs an x without bias, which in
+    # training half of them are not.
+    options = {"bound": False} if method.startswith("pd") else {}
+
+    def loss(network, inputs, reference, exposure):
+        image = chosen.combine(network, inputs, exposure=exposure, **options)
+        return chosen.loss(image / exposure, reference / exposure)
+
+    return loss
+
+
+def run(config: Config) -> dict:
+    """Train, or go on training.
+
+    Args:
+        config: the run.
+
+    Returns:
+        its card.
+
+    Raises:
+        ValueError: if the folder holds another run, or there are no frames.
+    """
+    schedule = QUICK if config.quick else config.schedule
+    every = 10 if config.quick else config.validate
+    config.out.mkdir(parents=True, exist_ok=True)
+    about = {
+        "method": config.method,
+        "size": config.size,
+        "schedule": dataclasses.asdict(schedule),
+        "data": config.data.name,
+    }
+    history = _resume(config.out, about)
+    loss = objective(config.method)
+    train, held = (prepare(config.method, frames) for frames in split(config.data))
+    about["frames"] = [len(train.reference), len(held.reference)]
+    judge = jax.jit(lambda network: training.evaluate(loss, network, held).mean())
+    network = ALL[config.method].network(
+        jax.random.key(schedule.seed), size=config.size
+    )
+    state = training.start(network, schedule)
+    if history:
+        state = files.load(config.out / "state.safetensors", state)
+    else:
+        history = {"step": [0], "train": [None], "validation": [float(judge(network))]}
+    losses, saved, since = [], time.monotonic(), time.monotonic()
+    bar = tqdm(total=schedule.steps, initial=int(state.step), unit="step")
+    for now, value in training.run(loss, state, train, schedule):
+        losses.append(value)
+        bar.update()
+        step = int(now.step)
+        if step % every and step != schedule.steps:
+            continue
+        found = float(judge(now.network))
+        history["step"].append(step)
+        history["train"].append(float(jnp.mean(jnp.stack(losses))))
+        history["validation"].append(found)
+        losses = []
+        bar.set_postfix(train=history["train"][-1], validation=found)
+        if time.monotonic() - saved > SAVE_EVERY or step == schedule.steps:
+            saved = time.monotonic()
+            _save(config.out, now, about, history)
+    bar.close()
+    print(f"{config.out}: {(time.monotonic() - since) / 60:.1f} min")
+    return json.loads((config.out / "network.json").read_text())
+
+
+def _resume(out: pathlib.Path, about: dict) -> dict:
+    """The losses of a run that is there; none of a new one."""
+    card = out / "network.json"
+    if not card.exists():
+        return {}
+    there = json.loads(card.read_text())
+    if any(there.get(key) != value for key, value in about.items()):
+        raise ValueError(f"{out} holds another run: choose another --out")
+    return there["losses"]
+
+
+def _save(out: pathlib.Path, state: training.State, about: dict, losses: dict) -> None:
+    """The network, its card, the state to go on from, and a plot."""
+    files.save(out / "state.safetensors", state)
+    files.save(out / "network.safetensors", state.network)
+    card = about | {"steps": int(state.step), "losses": losses}
+    temporary = out / "network.json.tmp"
+    temporary.write_text(json.dumps(card, indent=1))
+    temporary.replace(out / "network.json")
+    figure, axes = plt.subplots(figsize=(6, 4))
+    axes.plot(losses["step"][1:], losses["train"][1:], label="training")
+    axes.plot(losses["step"], losses["validation"], label="validation")
+    axes.set(xlabel="step", ylabel="loss", yscale="log", title=about["method"])
+    axes.legend()
+    figure.savefig(out / "losses.png", dpi=120)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Run from the command line."""
+    try:
+        run(tyro.cli(Config, description=__doc__))
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"train: {' '.join(str(error).split())}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""A denoiser whose kernels a network predicts."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.numerics.exposure import in_units
+from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.kernels import Kernels, predicted_mean
+from jscomb.typing import Image, Scalar, Variance
+
+Features = Float[Array, "h w f"]
+Network = Callable[[Image, Variance, Features], Kernels]
+
+
+def denoise(
+    network: Network,
+    noisy: Image,
+    variance: Variance,
+    features: Features,
+    *,
+    window: int = 11,
+    exposure: Scalar | None = None,
+) -> Image:
+    """Average each pixel's window with weights that a network predicts.
+
+    Pure, scale-equivariant, and differentiable in every array and in the network's
+    parameters, forwards too (for SURE).
+
+    Args:
+        network: of x, v and features, finite and at an exposure of one, to w² weights
+            a pixel, such as `learning.networks.KernelPredictor`.
+        noisy: x, linear radiance, shape [H,W,C].
+        variance: v of the mean x, squared radiance, at least zero, likewise.
+        features: of a range of about one, shape [H,W,F]; `features.stack`.
+        window: width of the windows in pixels, odd; the network's.
+        exposure: what to divide radiance by; None for `numerics.exposure` of x.
+
+    Returns:
+        the denoised image, linear radiance, shape [H,W,C]; pixels that are not finite
+        in some input take no part and stay as they are, or 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, or the network has another window.
+
+    Source: S. Bako et al., "Kernel-predicting convolutional networks for denoising
+    Monte Carlo renderings", 2017.
+    """
+    check_same_shape(noisy=noisy, variance=variance)
+    valid = finite(noisy, variance, features)
+    unit, x, v = in_units(exposure, valid, noisy, variance=variance)
+    kernels = network(x, v, jnp.where(valid, features, 0.0))
+    (mean,) = predicted_mean(x[None], kernels, window, mask=valid)
+    return jnp.where(valid, unit * mean, first_finite(noisy))

@@ -1,0 +1,79 @@
+"""Double shrinkage with a network's errors and confidence."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.double_shrinkage.shrinkage import combine
+from jscomb.numerics.exposure import in_units
+from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.kernels import Kernels, predicted_mean
+from jscomb.typing import Image, Scalar
+
+Error = Float[Array, "h w 1"]
+
+
+class Filters(NamedTuple):
+    """What the network decides.
+
+    Attributes:
+        kernels: weights of v and of m in each pixel's window, 2 w² a pixel.
+        confidence: eta^2, squared radiance, at least zero, shape [H,W,1].
+    """
+
+    kernels: Kernels
+    confidence: Error
+
+
+Network = Callable[[Image, Image, Image, Error, Error], Filters]
+
+
+def neural_combine(
+    network: Network,
+    prior: Image,
+    unbiased: Image,
+    biased: Image,
+    variance: Error,
+    mse: Error,
+    *,
+    window: int = 13,
+    exposure: Scalar | None = None,
+) -> Image:
+    """Blend two integrators and a prior by errors that a network pools.
+
+    Pure, scale-equivariant, and differentiable in every array and in the network's
+    parameters. The network's 2 w² weights a pixel exist for a strip of rows at a time.
+
+    Args:
+        network: of p, u, b, v and m, finite and at an exposure of one, such as
+            `learning.networks.ShrinkageNetwork`.
+        prior: p, linear radiance, shape [H,W,C].
+        unbiased: u, likewise.
+        biased: b, likewise.
+        variance: sample variance v of the mean u, mean over channels, squared radiance,
+            at least zero, shape [H,W,1].
+        mse: m, of b, likewise; single pixels' estimates will do.
+        window: width of the kernels in pixels, odd; the network's.
+        exposure: what to divide radiance by; None for `numerics.exposure` of u.
+
+    Returns:
+        the blend, linear radiance, shape [H,W,C]; at an invalid pixel the first finite
+        of (b, u), else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, or the network has another window.
+
+    Source: DSC section 4.3, eq. 9, 10.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased, prior=prior)
+    check_same_shape(variance=variance, mse=mse)
+    valid = finite(prior, unbiased, biased, variance, mse)
+    unit, u, p, b, v, m = in_units(
+        exposure, valid, unbiased, prior, biased, variance=variance, mse=mse
+    )
+    kernels, eta = network(p, u, b, v, m)
+    v, m = predicted_mean(jnp.stack([v, m]), kernels, window, mask=valid)
+    blend = unit * combine(p, u, b, v, m, eta)
+    return jnp.where(valid, blend, first_finite(biased, unbiased))

@@ -1,0 +1,258 @@
+"""From a frame to a network's inputs, and from them to an image.
+
+What a network was trained on and what it is used on have to be the same: both come from
+here. Radiance is divided by the frame's exposure; regressions have a stride of 2.
+"""
+
+import functools
+import importlib.resources
+import json
+import pathlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jscomb import double_shrinkage, james_stein, metrics, progressive
+from jscomb.denoisers import kernel_predicting, oidn
+from jscomb.frame import Frame
+from jscomb.learning import files, losses, networks
+from jscomb.numerics.sure import monte_carlo_sure
+from jscomb.typing import Image, Key, Scalar
+
+Inputs = dict[str, Image]
+Network = Any  # a pytree of parameters that can be called
+
+_STRIDE = 2  # of regressions
+
+
+class Method(NamedTuple):
+    """A combiner with a network.
+
+    Attributes:
+        network: draws one, of a key and a size.
+        variants: of a key, a frame and the name of its biased image, the inputs at an
+            exposure of one; first those that a frame is combined by, then others that
+            training may draw as well.
+        combine: of a network, the inputs and an exposure.
+        loss: of an image and a reference.
+    """
+
+    network: Callable[..., Network]
+    variants: Callable[[Key, Frame, str], list[Inputs]]
+    combine: Callable[..., Image]
+    loss: Callable[[Image, Image], Scalar]
+
+
+def _james_stein(key: Key, frame: Frame, name: str) -> list[Inputs]:
+    """Regressed where the halves say that it pays, and the other way."""
+    unit = frame.exposure
+    regressed = james_stein.regress(key, frame, name, stride=_STRIDE, always=True)
+    assert regressed.biased.halves is not None
+    full = frame.biased[name].full
+    pairs = [list(regressed.biased.halves), [full, full]]
+    return [
+        {
+            "unbiased": frame.color / unit,
+            "biased_a": a / unit,
+            "biased_b": b / unit,
+            "variance": frame.variance / jnp.square(unit),
+        }
+        for a, b in (pairs if regressed.change.helps else pairs[::-1])
+    ]
+
+
+def _double_shrinkage(key: Key, frame: Frame, name: str) -> list[Inputs]:
+    """What the combiner without a network makes of the frame on its way."""
+    del key
+    made = double_shrinkage.combine_frame(frame, name, stride=_STRIDE)
+    unit = frame.exposure
+    mean = lambda e: jnp.mean(e, axis=-1, keepdims=True) / jnp.square(unit)
+    return [
+        {
+            "prior": made.prior / unit,
+            "unbiased": frame.color / unit,
+            "biased": frame.biased[name].full / unit,
+            "variance": mean(made.variance),
+            "mse": mean(made.mse),
+        }
+    ]
+
+
+def _progressive(key: Key, frame: Frame, name: str) -> list[Inputs]:
+    """With SURE of Open Image Denoise; and with the two images' parts exchanged."""
+    if name != "oidn":
+        raise ValueError(
+            f"pd needs a denoiser's derivative, not only its image: it knows oidn, "
+            f"not {name!r}"
+        )
+    unit = frame.exposure
+    guides = {"albedo": frame.albedo, "normal": frame.normal}
+    if frame.albedo is None:
+        guides = {}
+    # One exposure, or the denoiser's would follow the probe.
+    denoise = functools.partial(oidn.denoise, exposure=jnp.ones_like(unit), **guides)
+    x = frame.color / unit
+    v = james_stein.robust_variance(frame.variance) / jnp.square(unit)
+    y, s, _ = monte_carlo_sure(key, denoise, x, v)
+    taken = {"unbiased": x, "biased": y, "variance": v, "sure": s}
+    return [taken, {"unbiased": y, "biased": x, "variance": s, "sure": v}]
+
+
+def _kernel_predicting(key: Key, frame: Frame, name: str) -> list[Inputs]:
+    """Of the noisy image and its features alone."""
+    del key, name
+    unit = frame.exposure
+    if frame.albedo is None or frame.normal is None or frame.depth is None:
+        raise ValueError("a kernel predictor needs albedo, normal and depth")
+    farthest = jnp.max(frame.depth, where=jnp.isfinite(frame.depth), initial=0.0)
+    return [
+        {
+            "noisy": frame.color / unit,
+            "variance": frame.variance / jnp.square(unit),
+            "albedo": frame.albedo,
+            "normal": frame.normal,
+            "depth": frame.depth / jnp.where(farthest > 0, farthest, 1.0),
+        }
+    ]
+
+
+def _predict(network: Network, inputs: Mapping[str, Image], **options: Any) -> Image:
+    """The kernel-predicting denoiser of separate features."""
+    features = [inputs[name] for name in ("albedo", "normal", "depth")]
+    return kernel_predicting.denoise(
+        network,
+        inputs["noisy"],
+        inputs["variance"],
+        jnp.concatenate(features, axis=-1),
+        **options,
+    )
+
+
+def _joint(
+    network: networks.Joint, inputs: Mapping[str, Image], **options: Any
+) -> Image:
+    """Denoised and combined."""
+    y = _predict(network.denoiser, inputs, **options)
+    x, v = inputs["noisy"], inputs["variance"]
+    return james_stein.neural_combine(network.combiner, x, y, y, v, **options)
+
+
+def _of_arrays(combine: Callable[..., Image]) -> Callable[..., Image]:
+    """A combiner whose arrays are named as the inputs are."""
+    return lambda network, inputs, **options: combine(network, **inputs, **options)
+
+
+METHODS = {
+    "njs": Method(
+        networks.JamesSteinNetwork,
+        _james_stein,
+        _of_arrays(james_stein.neural_combine),
+        losses.log_l2,
+    ),
+    "dsc": Method(
+        networks.ShrinkageNetwork,
+        _double_shrinkage,
+        _of_arrays(double_shrinkage.neural_combine),
+        metrics.smape,
+    ),
+    "pd": Method(
+        networks.MixingNetwork,
+        _progressive,
+        _of_arrays(progressive.neural_combine),
+        metrics.smape,
+    ),
+}
+"""The combiners whose trained parameters come with the package."""
+
+DENOISERS = {
+    "kernels": Method(
+        networks.KernelPredictor, _kernel_predicting, _predict, losses.log_l2
+    ),
+    "kernels-njs": Method(networks.Joint, _kernel_predicting, _joint, losses.log_l2),
+}
+"""A learned biased image, alone and jointly with the combiner; to be trained."""
+
+
+def shipped(name: str) -> Network:
+    """A network with the parameters that come with the package.
+
+    Args:
+        name: njs, dsc or pd.
+
+    Returns:
+        the network.
+
+    Raises:
+        ValueError: if there is no such method.
+    """
+    folder = importlib.resources.files("jscomb.learning") / "weights"
+    return load(_known(name), pathlib.Path(str(folder)) / f"{name}.safetensors")
+
+
+def load(method: Method, path: pathlib.Path) -> Network:
+    """A network with the parameters of a file.
+
+    Args:
+        method: whose network it is.
+        path: safetensors file, with its card beside it: the same name, ending in json,
+            which says the network's size.
+
+    Returns:
+        the network.
+
+    Raises:
+        ValueError: if a file is missing or damaged, or of another network.
+    """
+    card = path.with_suffix(".json")
+    try:
+        size = json.loads(card.read_text())["size"]
+    except FileNotFoundError:
+        raise ValueError(f"{card}: no such card of a network") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{card}: not the card of a network: {error}") from None
+    like = jax.eval_shape(lambda: method.network(jax.random.key(0), size=size))
+    return files.load(path, like)
+
+
+def _known(name: str) -> Method:
+    """The method of that name."""
+    if name not in METHODS:
+        raise ValueError(f"no method {name!r}; there are {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def combine_frame(
+    key: Key, frame: Frame, name: str, *, method: str, network: Network | None = None
+) -> Image:
+    """Combine a frame with one of its biased images by a trained network.
+
+    Decides on values (features that tell nothing, whether to regress), so it is not for
+    `jit`.
+
+    Args:
+        key: of random probes.
+        frame: with variance and halves.
+        name: of the biased image, with halves; "oidn" for pd, which denoises anew.
+        method: njs, dsc or pd.
+        network: None for the one that comes with the package.
+
+    Returns:
+        the combination, linear radiance, shape [H,W,C].
+
+    Raises:
+        ValueError: if the frame lacks what the method needs.
+        ImportError: for pd, if Open Image Denoise is not installed.
+    """
+    inputs = _known(method).variants(key, frame, name)[0]
+    network = shipped(method) if network is None else network
+    return frame.exposure * _combine(network, inputs, method=method)
+
+
+@functools.partial(jax.jit, static_argnames="method")
+def _combine(network: Network, inputs: Inputs, *, method: str) -> Image:
+    """Of inputs at an exposure of one."""
+    some = next(iter(inputs.values()))
+    one = jnp.ones((), some.dtype)
+    return METHODS[method].combine(network, inputs, exposure=one)

@@ -1,0 +1,196 @@
+"""Training: draw crops, lower a loss by Adam under a one-cycle schedule.
+
+A run is a frozen configuration. Its step k draws with the key k of the seed, so a run
+that goes on from a saved state does what one without a pause would have done.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Float
+
+from jscomb.typing import Image, Key, Scalar
+
+Network = Any  # a pytree of parameters that can be called
+Objective = Callable[[Network, dict[str, Image], Image, Scalar], Scalar]
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """How to train.
+
+    Attributes:
+        steps: of the optimiser.
+        batch: crops a step.
+        crop: width and height of a crop in pixels.
+        rate: learning rate at the peak of the cycle.
+        jitter: largest factor of two that the exposure is off by, either way.
+        seed: of the parameters and of all draws.
+    """
+
+    steps: int = 3000
+    batch: int = 4
+    crop: int = 128
+    rate: float = 1e-3
+    jitter: float = 1.0
+    seed: int = 0
+
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam; steps of an unlikely size are cut, as fireflies make them."""
+        rate = optax.cosine_onecycle_schedule(self.steps, self.rate)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+
+
+class Examples(NamedTuple):
+    """Frames to learn from, of one size.
+
+    Attributes:
+        inputs: at an exposure of one, [N,V,H,W,C] each; V variants of each frame.
+        reference: likewise, [N,H,W,3].
+    """
+
+    inputs: dict[str, Float[Array, "n v h w _"]]
+    reference: Float[Array, "n h w c"]
+
+
+class State(NamedTuple):
+    """Where a run stands.
+
+    Attributes:
+        network: its parameters.
+        optimiser: Adam's moments.
+        step: steps done.
+    """
+
+    network: Network
+    optimiser: optax.OptState
+    step: Array
+
+
+def start(network: Network, schedule: Schedule) -> State:
+    """The state before the first step.
+
+    Args:
+        network: as drawn.
+        schedule: how to train.
+
+    Returns:
+        the state.
+    """
+    optimiser = schedule.optimiser().init(network)
+    return State(network, optimiser, jnp.zeros((), jnp.int32))
+
+
+def run(
+    objective: Objective, state: State, examples: Examples, schedule: Schedule
+) -> Iterator[tuple[State, Scalar]]:
+    """Train from a state to the end of the schedule.
+
+    Args:
+        objective: loss of a network, one frame's inputs, its reference and an exposure.
+        state: where to go on.
+        examples: to draw crops from.
+        schedule: how to train.
+
+    Yields:
+        after each step the state and the loss of its batch.
+
+    Raises:
+        ValueError: if the crops are larger than the frames.
+    """
+    size = examples.reference.shape[1:3]
+    if schedule.crop > min(size):
+        raise ValueError(f"crops of {schedule.crop} do not fit frames of {size}")
+    optimiser = schedule.optimiser()
+    seed = jax.random.key(schedule.seed)
+
+    @jax.jit
+    def step(state: State, examples: Examples) -> tuple[State, Scalar]:
+        """One of the optimiser."""
+        keys = jax.random.split(jax.random.fold_in(seed, state.step), schedule.batch)
+        of_network = lambda network: _batch_loss(
+            objective, network, keys, examples, schedule
+        )
+        value, gradient = jax.value_and_grad(of_network)(state.network)
+        updates, moments = optimiser.update(gradient, state.optimiser, state.network)
+        network = optax.apply_updates(state.network, updates)
+        return State(network, moments, state.step + 1), value
+
+    while state.step < schedule.steps:
+        state, value = step(state, examples)
+        yield state, value
+
+
+def evaluate(
+    objective: Objective, network: Network, examples: Examples
+) -> Float[Array, " n"]:
+    """Loss of every whole frame in its first variant, at its own exposure.
+
+    Args:
+        objective: as for `run`.
+        network: to be judged.
+        examples: frames.
+
+    Returns:
+        the losses, shape [N].
+    """
+    one = jnp.ones((), examples.reference.dtype)
+    first = {name: array[:, 0] for name, array in examples.inputs.items()}
+    of_frame = lambda frame: objective(network, frame[0], frame[1], one)
+    return lax.map(of_frame, (first, examples.reference), batch_size=4)
+
+
+def draw(
+    key: Key, examples: Examples, schedule: Schedule
+) -> tuple[dict[str, Image], Image, Scalar]:
+    """A crop of some frame, turned and flipped, its colours exchanged.
+
+    Args:
+        key: a typed key.
+        examples: frames.
+        schedule: the crop's size and how far the exposure may be off.
+
+    Returns:
+        inputs, reference, and the exposure that the network is to believe.
+    """
+    which, variant, corner, turns, colours, exposure = jax.random.split(key, 6)
+    frames, height, width, _ = examples.reference.shape
+    frame = jax.random.randint(which, (), 0, frames)
+    size = schedule.crop
+    ends = jnp.array([height - size + 1, width - size + 1])
+    row, column = jax.random.randint(corner, (2,), 0, ends)
+    flip_rows, flip_columns, transposed = jax.random.bernoulli(turns, shape=(3,))
+    order = jax.random.permutation(colours, 3)
+    variants = next(iter(examples.inputs.values())).shape[1]
+    way = jax.random.randint(variant, (), 0, variants)
+
+    def cut(array: Array, *place: Array) -> Image:
+        c = array.shape[-1]
+        at = (*place, row, column, jnp.zeros_like(row))
+        sizes = (*(1 for _ in place), size, size, c)
+        image = lax.dynamic_slice(array, at, sizes).reshape(size, size, c)
+        image = jnp.where(flip_rows, image[::-1], image)
+        image = jnp.where(flip_columns, image[:, ::-1], image)
+        image = jnp.where(transposed, image.swapaxes(0, 1), image)
+        return image[..., order] if c == 3 else image
+
+    inputs = {name: cut(array, frame, way) for name, array in examples.inputs.items()}
+    off = jax.random.uniform(exposure, (), examples.reference.dtype, -1.0, 1.0)
+    return inputs, cut(examples.reference, frame), 2 ** (schedule.jitter * off)
+
+
+def _batch_loss(
+    objective: Objective,
+    network: Network,
+    keys: Key,
+    examples: Examples,
+    schedule: Schedule,
+) -> Scalar:
+    """Mean loss of one crop a key."""
+    one = lambda key: objective(network, *draw(key, examples, schedule))
+    return jnp.mean(jax.vmap(one)(keys))

@@ -1,0 +1,284 @@
+"""Networks: convolutions, sizes, and the combiners that they serve."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.test_util import check_grads
+
+from jscomb import double_shrinkage, james_stein, progressive
+from jscomb.denoisers import kernel_predicting
+from jscomb.learning import networks
+from jscomb.numerics.kernels import Kernels
+from jscomb.numerics.sure import monte_carlo_sure
+
+RNG = np.random.default_rng(3)
+
+
+def key():
+    """The same key, as if for the first time."""
+    return jax.random.key(1)
+
+
+def parameters_of(network) -> int:
+    """How many numbers a network has."""
+    return sum(p.size for p in jax.tree.leaves(network))
+
+
+def random_convolution(size=3, inputs=2, outputs=3):
+    """One with a bias, in float64."""
+    convolution = networks.Convolution(key(), inputs, outputs, size=size)
+    draw = lambda leaf: jnp.asarray(RNG.normal(size=leaf.shape))
+    return jax.tree.map(draw, convolution)
+
+
+@pytest.mark.parametrize("size", [1, 3, 5])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (17, 4)])
+def test_convolution_matches_loops(size, shape):
+    convolution, r = random_convolution(size), size // 2
+    image = RNG.normal(size=(*shape, 2))
+    kernel, bias = (np.asarray(p[...]) for p in (convolution.kernel, convolution.bias))
+    padded = np.pad(image, ((r, r), (r, r), (0, 0)))
+    wanted = np.zeros((*shape, 3))
+    for i, j in np.ndindex(*shape):
+        near = padded[i : i + size, j : j + size]
+        wanted[i, j] = np.einsum("ijc,ijcd->d", near, kernel) + bias
+    found = convolution(jnp.asarray(image))
+    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+    if shape[0] > 2 * r:
+        inner = convolution(jnp.asarray(image), inner=True)
+        np.testing.assert_allclose(inner, wanted[r : shape[0] - r], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 3, 5])
+def test_convolution_derivatives(size):
+    """Ours in the kernel against XLA's, under vmap as in training; both modes."""
+    convolution = random_convolution(size)
+    images = jnp.asarray(RNG.normal(size=(4, 19, 6, 2)))
+
+    def ours(convolution, images):
+        return jnp.sum(jnp.sin(jax.vmap(convolution)(images)))
+
+    def xla(convolution, images):
+        kernel, bias = convolution.kernel[...], convolution.bias[...]
+        numbers = ("NHWC", "HWIO", "NHWC")
+        out = lax.conv_general_dilated(
+            images, kernel, (1, 1), "SAME", dimension_numbers=numbers
+        )
+        return jnp.sum(jnp.sin(out + bias.reshape(1, 1, 1, -1)))
+
+    at = convolution, images
+    for found, wanted in zip(
+        jax.tree.leaves(jax.jit(jax.grad(ours, (0, 1)))(*at)),
+        jax.tree.leaves(jax.grad(xla, (0, 1))(*at)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-12)
+    check_grads(jax.jit(ours), (convolution, images[:1, :9]), order=2)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 8), (5, 7), (9, 1)])
+def test_unet_of_any_size(shape):
+    """Sizes that the levels do not divide are those of an image with zeros around."""
+    net = networks.UNet(key(), 2, size="light")
+    image = jnp.asarray(RNG.random((*shape, 2)))
+    out = net(image)
+    assert out.shape == (*shape, 16)
+    block = jnp.zeros((12, 12, 2)).at[: shape[0], : shape[1]].set(image)
+    need = [-(-n // 4) * 4 for n in shape]
+    padded = net(block[: need[0], : need[1]])
+    np.testing.assert_allclose(out, padded[: shape[0], : shape[1]], rtol=1e-12)
+
+
+def test_sizes_are_the_papers():
+    counted = parameters_of(networks.JamesSteinNetwork(key()))
+    assert 0.53e6 < counted < 0.55e6  # NJS: about 0.54 million
+    shapes = jax.tree.map(np.shape, networks.MixingNetwork(key()))
+    assert shapes.first.kernel.get_value() == (5, 5, 18, 48)
+    assert shapes.last.kernel.get_value() == (3, 3, 48, 9)
+    shrinkage = networks.ShrinkageNetwork(key())
+    outputs = [c.kernel.shape[-1] for c in (shrinkage.kernels, shrinkage.confidence)]
+    assert sum(outputs) == 339  # DSC: 2 13^2 + 1
+    for kind in (networks.JamesSteinNetwork, networks.MixingNetwork):
+        light, full = (parameters_of(kind(key(), size=s)) for s in ("light", "full"))
+        assert full / 4 < light < full / 3
+
+
+def stub_kernels(weights):
+    """The same weights at every pixel."""
+    shape = lambda f: (*f.shape[:2], len(weights))
+    head = lambda f: jnp.broadcast_to(jnp.asarray(weights, f.dtype), shape(f))
+    return lambda image: Kernels(image, head, 0)
+
+
+@pytest.fixture
+def images(glass_frame):
+    """x, y, y_a, y_b and variance, float64."""
+    y = glass_frame.biased["oidn"]
+    given = glass_frame.color, y.full, *y.halves, glass_frame.variance
+    return [i.astype(jnp.float64) for i in given]
+
+
+def test_equal_weights_are_the_estimator_without_a_network(images):
+    x, _, a, b, v = images
+    equal = stub_kernels(np.ones(225))
+
+    def network(x, v, a, b):
+        return james_stein.Parameters(equal(x), jnp.full_like(x[..., :1], 0.25))
+
+    found = james_stein.neural_combine(network, x, a, b, v)
+    pooled = james_stein.smooth_variance(v, window=15)
+    wanted = james_stein.combine(x, 0.25 * a + 0.75 * b, pooled)
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+
+
+def test_unit_kernels_are_double_shrinkage_of_single_pixels(images):
+    x, y, p, _, v = images
+    one, eta = v.mean(-1, keepdims=True), jnp.full_like(v[..., :1], 0.3)
+    delta = np.zeros(169)
+    delta[84] = 1
+    both = stub_kernels(np.concatenate([delta, delta]))
+
+    def network(p, u, b, v, m):
+        return double_shrinkage.Filters(both(u), eta)
+
+    unit = jnp.asarray(2.0)
+    found = double_shrinkage.neural_combine(
+        network, p, x, y, one, one / 3, exposure=unit
+    )
+    # The network's confidence is in units of the squared exposure.
+    wanted = double_shrinkage.combine(p, x, y, one, one / 3, 4 * eta)
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+
+
+def test_mixing_is_what_the_network_says(images):
+    x, y, _, _, v = images
+    outputs = jnp.stack([jnp.full_like(x, f) for f in (0.8, 0.2, 2.0)], axis=2)
+    found = progressive.neural_combine(
+        lambda x, y, v, s: outputs, x, y, v, v, bound=False
+    )
+    np.testing.assert_allclose(found, 0.7 * x + 0.3 * y, rtol=1e-12)
+
+
+NETWORKS = {
+    "njs": (
+        networks.JamesSteinNetwork,
+        lambda n, x, y, v: james_stein.neural_combine(n, x, y, 0.9 * y, v),
+    ),
+    "dsc": (
+        networks.ShrinkageNetwork,
+        lambda n, x, y, v: double_shrinkage.neural_combine(
+            n, (x + y) / 2, x, y, v[..., :1], v[..., :1] / 2
+        ),
+    ),
+    "pd": (
+        networks.MixingNetwork,
+        lambda n, x, y, v: progressive.neural_combine(n, x, y, v, v / 2),
+    ),
+    "kernels": (
+        networks.KernelPredictor,
+        lambda n, x, y, v: kernel_predicting.denoise(
+            n, x, v, jnp.full((*x.shape[:2], 7), 0.3, x.dtype)
+        ),
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=NETWORKS)
+def neural(request):
+    """A light network and its combiner, with value and gradient compiled once."""
+    kind, combine = NETWORKS[request.param]
+    network = kind(key(), size="light")
+    both = lambda n, *images: jnp.sum(combine(n, *images))
+    gradient = jax.jit(jax.value_and_grad(both, argnums=(0, 1, 2, 3)))
+    return network, jax.jit(combine), gradient
+
+
+def hard_cases():
+    """x, y and variance that have been the end of other programs."""
+    x, y, v = RNG.random((3, 12, 13, 3)).astype(np.float32)
+    firefly = x.copy()
+    firefly[4, 5] = 1e6
+    certain = np.zeros_like(v)
+    square = np.where(firefly > 1, 1e12, v).astype(np.float32)
+    bad, bad_v = x.copy(), v.copy()
+    bad[3, 4, 1], bad_v[6, 6, 0] = np.nan, np.inf
+    small = np.float32(1e-8)
+    return {
+        "firefly": (firefly, y, square),
+        "dark": (small * x, small * y, small**2 * v),
+        "bright": (1 / small * x, 1 / small * y, 1 / small**2 * v),
+        "certain": (x, y, certain),
+        "same": (x, x, v),
+        "invalid": (bad, y, bad_v),
+        "black": (0 * x, 0 * y, 0 * v),
+    }
+
+
+@pytest.mark.parametrize("case", hard_cases())
+def test_finite_at_hard_cases(neural, case):
+    """The image, and the gradients in it and in every parameter."""
+    network, combine, gradient = neural
+    images = [jnp.asarray(i) for i in hard_cases()[case]]
+    assert np.isfinite(combine(network, *images)).all()
+    value, gradients = gradient(network, *images)
+    assert np.isfinite(value)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradients))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 6), (9, 2)])
+def test_any_size(neural, size):
+    network, combine, _ = neural
+    images = [jnp.asarray(RNG.random((*size, 3)), jnp.float32) for _ in range(3)]
+    out = combine(network, *images)
+    assert out.shape == (*size, 3)
+    assert np.isfinite(out).all()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scale_equivariant(neural, scale, glass_frame):
+    network, combine, _ = neural
+    x, y, v = (
+        i[20:44, 20:44].astype(jnp.float64)
+        for i in (
+            glass_frame.color,
+            glass_frame.biased["oidn"].full,
+            glass_frame.variance,
+        )
+    )
+    found = combine(network, scale * x, scale * y, scale**2 * v)
+    np.testing.assert_allclose(found, scale * combine(network, x, y, v), rtol=1e-8)
+
+
+def test_gradients_reach_every_parameter(neural, glass_frame):
+    network, _, gradient = neural
+    images = glass_frame.color, glass_frame.biased["oidn"].full, glass_frame.variance
+    _, (of_network, *_) = gradient(network, *images)
+    for leaf in jax.tree.leaves(of_network):
+        assert np.any(np.asarray(leaf) != 0)
+
+
+def test_sure_of_a_network(glass_frame):
+    """Forward derivatives go through the kernels' strips and the convolutions."""
+    network = networks.KernelPredictor(key(), size="light")
+    cut = lambda i: i[:12, :12].astype(jnp.float64)
+    x, v = cut(glass_frame.color), cut(glass_frame.variance)
+    features = cut(
+        jnp.concatenate(
+            [glass_frame.albedo, glass_frame.normal, glass_frame.depth], axis=-1
+        )
+    )
+    unit = jnp.asarray(1.0)
+    denoise = lambda x: kernel_predicting.denoise(
+        network, x, v, features, exposure=unit
+    )
+    found = monte_carlo_sure(key(), denoise, x, v)
+    deviation = jnp.sqrt(v) * jax.random.rademacher(
+        jax.random.split(key())[0], x.shape, x.dtype
+    )
+    step = 1e-6
+    moved = (denoise(x + step * deviation) - denoise(x - step * deviation)) / (2 * step)
+    np.testing.assert_allclose(
+        found.divergence, deviation * moved, rtol=1e-4, atol=1e-8
+    )
