@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jscomb import progressive
+from jscomb import james_stein, progressive
 from jscomb.learning import methods
 from jscomb.learning.methods import METHODS
 
@@ -29,7 +29,15 @@ def _direct(network, inputs, **options):
     return progressive.neural_combine(outputs, **inputs, **options)
 
 
+def _whitened(network, inputs, **options):
+    """NJS with the whitened rule, which its paper does not know."""
+    return james_stein.neural_combine(
+        network, **inputs, window=7, whiten=True, **options
+    )
+
+
 ABLATIONS: dict[str, methods.Method] = {
+    "njs-whitened": METHODS["njs"]._replace(combine=_whitened),
     "pd-no-sure": METHODS["pd"]._replace(variants=_no_sure),
     "pd-direct": METHODS["pd"]._replace(combine=_direct),
 }

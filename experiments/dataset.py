@@ -15,7 +15,9 @@ Not so for absolute errors, nor for the weights that a relative error takes from
 bend it a little, the less the more samples the reference has.
 """
 
+import concurrent.futures
 import dataclasses
+import multiprocessing
 import pathlib
 import sys
 import time
@@ -29,6 +31,7 @@ from experiments import render
 from jscomb.denoisers import oidn
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
+SCENES_A_PROCESS = 10
 STREAMS = 100_000  # apart from each other: seeds of the frames of one scene
 
 
@@ -101,22 +104,36 @@ def run(config: Config) -> list[pathlib.Path]:
 
     Raises:
         ImportError: without Open Image Denoise.
+        RuntimeError: if the renderer crashed; the same command goes on.
     """
     if not oidn.available():
         raise ImportError('a dataset needs a denoiser: pip install "jscomb[oidn]"')
     config.out.mkdir(parents=True, exist_ok=True)
-    files, start, made = [], time.monotonic(), 0
-    scenes = range(config.seed, config.seed + config.scenes)
-    for scene in tqdm(scenes, unit="scene", desc="dataset"):
-        for frame in renders(config, scene):
-            if not frame.out.exists():
-                render.run(frame)
-                made += 1
-            files.append(frame.out)
+    start, seeds = time.monotonic(), range(config.seed, config.seed + config.scenes)
+    every = {seed: list(renders(config, seed)) for seed in seeds}
+    todo = {s: [f for f in fs if not f.out.exists()] for s, fs in every.items()}
+    # A process a few scenes: Dr.Jit keeps every scene's compiled code, and was seen to
+    # crash after some ninety.
+    with concurrent.futures.ProcessPoolExecutor(
+        max_workers=1,
+        mp_context=multiprocessing.get_context("spawn"),
+        max_tasks_per_child=SCENES_A_PROCESS,
+    ) as process:
+        rendered = process.map(_render_all, filter(None, todo.values()))
+        missing = sum(map(bool, todo.values()))
+        made = sum(tqdm(rendered, total=missing, unit="scene", desc="dataset"))
+    files = [frame.out for frames in every.values() for frame in frames]
     megabytes = sum(f.stat().st_size for f in files) / 1e6
     minutes = (time.monotonic() - start) / 60
     print(f"{len(files)} frames, {megabytes:.0f} MB; {made} made in {minutes:.1f} min")
     return files
+
+
+def _render_all(frames: list[render.Config]) -> int:
+    """Render frames; how many."""
+    for frame in frames:
+        render.run(frame)
+    return len(frames)
 
 
 def main() -> None:

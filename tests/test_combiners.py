@@ -17,6 +17,7 @@ from jscomb import (
 )
 from jscomb.cli import METHODS
 from jscomb.denoisers import smoothing
+from jscomb.learning import networks
 
 
 def ensemble_of(x, y, v, **options):
@@ -35,6 +36,8 @@ def uncorrelated_of(x, y, v):
     return uncorrelated.combine(x[None] + away, y[None] + away, gamma, 1)
 
 
+NETWORK = networks.JamesSteinNetwork(jax.random.key(0), size="light")
+
 COMBINERS = {
     "james_stein": james_stein.combine,
     "james_stein whitened": lambda x, y, v: james_stein.combine(x, y, v, whiten=True),
@@ -43,6 +46,9 @@ COMBINERS = {
     ),
     "james_stein corrected": lambda x, y, v: james_stein.combine(
         x, y, v, whiten=True, divergence=v / 4
+    ),
+    "james_stein neural": lambda x, y, v: james_stein.neural_combine(
+        NETWORK, x, y, (x + y) / 2, v
     ),
     "ensemble": lambda x, y, v: ensemble_of(x, y, v),
     "ensemble multi-scale": lambda x, y, v: ensemble_of(
@@ -155,8 +161,9 @@ def test_a_bad_pixel_stays_local(combine, images, image, bad, request):
     reach = 20  # windows of a window, and pooling before them
     rows, columns = np.ogrid[:64, :64]
     far = (abs(rows - 20) > reach) | (abs(columns - 30) > reach)
-    # The frame is one of the scales; its mean noise sets the bound's width.
-    by_frame = {"multi-scale": 0.02, "progressive": 1e-4}
+    # The frame is one of the scales; its mean noise sets the bound's width; a network
+    # sees half the crop, and the exposure all of it.
+    by_frame = {"multi-scale": 0.02, "progressive": 1e-4, "neural": 0.02}
     loose = [r for name, r in by_frame.items() if name in request.node.name]
     if loose:
         np.testing.assert_allclose(out[far], clean[far], rtol=loose[0], atol=1e-3)

@@ -36,6 +36,8 @@ def neural_combine(
     variance: Variance,
     *,
     window: int = 15,
+    kernel_window: int = 15,
+    whiten: bool = False,
     exposure: Scalar | None = None,
 ) -> Image:
     """Shrink towards the better regression by the variance that a network makes out.
@@ -51,7 +53,10 @@ def neural_combine(
         biased_b: y^_b, likewise.
         variance: sample variance of the mean x, squared radiance, at least zero,
             likewise.
-        window: width of the windows in pixels, odd, at least three; the network's.
+        window: width of the windows that are shrunk, in pixels, odd, at least three.
+        kernel_window: width of the network's kernels in pixels, odd.
+        whiten: allow each pixel its own variance within a window: the greater of its
+            sample variance and what the network makes of its neighbourhood.
         exposure: what to divide radiance by; None for `numerics.exposure` of x.
 
     Returns:
@@ -59,9 +64,9 @@ def neural_combine(
         first finite of (y^_a, y^_b, x), else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ, or the network has another window.
+        ValueError: while tracing, if shapes differ, or the network has other kernels.
 
-    Source: NJS eq. 6, 7, 10, 13.
+    Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.
     """
     check_same_shape(
         unbiased=unbiased, biased_a=biased_a, biased_b=biased_b, variance=variance
@@ -71,8 +76,10 @@ def neural_combine(
         exposure, valid, unbiased, biased_a, biased_b, variance=variance
     )
     parameters = network(x, v, a, b)
-    (s2,) = predicted_mean(v[None], parameters.kernels, window, mask=valid)
+    (s2,) = predicted_mean(v[None], parameters.kernels, kernel_window, mask=valid)
+    if whiten:
+        s2 = jnp.maximum(v, s2)
     y = parameters.share * a + (1 - parameters.share) * b
     # Where something is missing nothing is combined, nor does it count for others.
-    shrunk = combine(x, y, jnp.where(valid, s2, jnp.nan), window=window)
+    shrunk = combine(x, y, jnp.where(valid, s2, jnp.nan), window=window, whiten=whiten)
     return jnp.where(valid, unit * shrunk, first_finite(biased_a, biased_b, unbiased))

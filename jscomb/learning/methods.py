@@ -47,11 +47,13 @@ class Method(NamedTuple):
 
 def _james_stein(key: Key, frame: Frame, name: str) -> list[Inputs]:
     """Regressed where the halves say that it pays, and the other way."""
-    unit = frame.exposure
-    regressed = james_stein.regress(key, frame, name, stride=_STRIDE, always=True)
-    assert regressed.biased.halves is not None
-    full = frame.biased[name].full
-    pairs = [list(regressed.biased.halves), [full, full]]
+    unit, image = frame.exposure, frame.biased[name]
+    pairs = [[image.full, image.full]]
+    if image.halves is not None:
+        regressed = james_stein.regress(key, frame, name, stride=_STRIDE, always=True)
+        assert regressed.biased.halves is not None
+        place = 0 if regressed.change.helps else 1
+        pairs.insert(place, list(regressed.biased.halves))
     return [
         {
             "unbiased": frame.color / unit,
@@ -59,7 +61,7 @@ def _james_stein(key: Key, frame: Frame, name: str) -> list[Inputs]:
             "biased_b": b / unit,
             "variance": frame.variance / jnp.square(unit),
         }
-        for a, b in (pairs if regressed.change.helps else pairs[::-1])
+        for a, b in pairs
     ]
 
 
@@ -233,8 +235,9 @@ def combine_frame(
 
     Args:
         key: of random probes.
-        frame: with variance and halves.
-        name: of the biased image, with halves; "oidn" for pd, which denoises anew.
+        frame: with variance and three channels.
+        name: of the biased image; njs regresses where it has halves, dsc needs them, pd
+            denoises anew and knows "oidn" alone.
         method: njs, dsc or pd.
         network: None for the one that comes with the package.
 
@@ -245,6 +248,12 @@ def combine_frame(
         ValueError: if the frame lacks what the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
     """
+    if name not in frame.biased:
+        raise ValueError(f"no biased image {name!r}; there are {list(frame.biased)}")
+    if frame.color.shape[-1] != 3:
+        raise ValueError(
+            f"the networks want three channels, got {frame.color.shape[-1]}"
+        )
     inputs = _known(method).variants(key, frame, name)[0]
     network = shipped(method) if network is None else network
     return frame.exposure * _combine(network, inputs, method=method)
