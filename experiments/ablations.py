@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jscomb import james_stein, progressive
-from jscomb.learning import methods
+from jscomb import james_stein, metrics, progressive
+from jscomb.learning import losses, methods
 from jscomb.learning.methods import METHODS
 
 
@@ -29,16 +29,17 @@ def _direct(network, inputs, **options):
     return progressive.neural_combine(outputs, **inputs, **options)
 
 
-def _whitened(network, inputs, **options):
-    """NJS with the whitened rule, which its paper does not know."""
-    return james_stein.neural_combine(
-        network, **inputs, window=7, whiten=True, **options
-    )
+def _equal(network, inputs, **options):
+    """NJS as in its paper: one variance a window, of 15x15."""
+    return james_stein.neural_combine(network, **inputs, **options)
 
 
 ABLATIONS: dict[str, methods.Method] = {
-    "njs-whitened": METHODS["njs"]._replace(combine=_whitened),
+    "njs-equal": METHODS["njs"]._replace(combine=_equal),
+    "pd-smape": METHODS["pd"]._replace(loss=metrics.smape),
+    "dsc-log": METHODS["dsc"]._replace(loss=losses.log_l2),
     "pd-no-sure": METHODS["pd"]._replace(variants=_no_sure),
     "pd-direct": METHODS["pd"]._replace(combine=_direct),
 }
-"""The progressive paper's table 4; its third, without the bound, trains nothing."""
+"""njs-equal and pd-smape are as in the papers; pd-no-sure and pd-direct are of PD's
+table 4, whose third, without the bound, trains nothing."""

@@ -17,6 +17,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
@@ -39,12 +40,14 @@ class Config:
         folder: of NumPy archives.
         runs: folder of runs; None for the shipped networks.
         results: file that results are kept in as they come.
+        curves: picture of all runs' losses to write.
         quick: only the first archive, at its least sample count.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
     runs: pathlib.Path | None = None
     results: pathlib.Path | None = None
+    curves: pathlib.Path | None = None
     quick: bool = False
 
 
@@ -87,12 +90,11 @@ def measure_network(
 ) -> dict[str, float]:
     """A network as it is used, and with parts of its method left out."""
     chosen = train.ALL[method]
-    combine = lambda inputs, **o: chosen.combine(
-        network, inputs, exposure=jnp.ones(()), **o
-    )
+    one = jnp.ones((), frame.color.dtype)
+    combine = lambda inputs, **o: chosen.combine(network, inputs, exposure=one, **o)
     taken, *_ = chosen.variants(jax.random.key(0), frame, "oidn")
     images = {"": jax.jit(combine)(taken)}
-    if method == "njs":
+    if method.startswith("njs"):
         regressed, plain = map(jax.jit(combine), _james_stein_inputs(frame))
         images |= {", always regressed": regressed, ", never regressed": plain}
     if method.startswith("pd"):
@@ -179,9 +181,38 @@ def summary(
     return table
 
 
+def plot_curves(runs: pathlib.Path, out: pathlib.Path) -> None:
+    """Training and validation losses of all runs.
+
+    Args:
+        runs: folder of runs.
+        out: picture to write.
+    """
+    cards = {f.parent.name: f for f in sorted(runs.glob("*/network.json"))}
+    columns = min(len(cards), 4)
+    lines = -(-len(cards) // columns)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(3.2 * columns, 2.6 * lines), squeeze=False
+    )
+    for ax in axes.flat[len(cards) :]:
+        ax.axis("off")
+    for ax, (name, card) in zip(axes.flat, cards.items(), strict=False):
+        losses = json.loads(card.read_text())["losses"]
+        ax.plot(losses["step"][1:], losses["train"][1:], label="training")
+        ax.plot(losses["step"], losses["validation"], label="validation")
+        ax.set(title=name, xlabel="step", ylabel="loss", yscale="log")
+    axes[0, 0].legend()
+    figure.tight_layout()
+    figure.savefig(out, dpi=110)
+    plt.close(figure)
+
+
 def main() -> None:
     """Print both tables."""
-    rows = run(tyro.cli(Config, description=__doc__))
+    config = tyro.cli(Config, description=__doc__)
+    if config.curves and config.runs:
+        plot_curves(config.runs, config.curves)
+    rows = run(config)
     for name, column in summary(rows).items():
         numbers = " | ".join(f"{value:.3f}" for value in column.values())
         print(f"| {name} | {numbers} |")

@@ -112,7 +112,7 @@ def run(config: Config) -> dict[str, Cost]:
     counts, memory = {"ceiling": operations(single)}, {"ceiling": 0.0}
     for method, parts in METHODS.items():
         inputs = inputs_of(method, size)
-        for kind in ("light", "full"):
+        for kind in ("light",) if config.quick else ("light", "full"):
             network, name = parts.network(jax.random.key(3), size=kind), method + " "
             name += kind
             combine = jax.jit(functools.partial(parts.combine, exposure=jnp.ones(())))

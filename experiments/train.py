@@ -1,6 +1,6 @@
 """Train one of the networks on a folder of frames.
 
-    python -m experiments.train njs DATASET --out RUN --size light --steps 3000
+    python -m experiments.train njs DATASET --out RUN --size light
 
 Frames of one scene in ten are held out for validation. RUN gets the network
 (`network.safetensors` with its card `network.json`), the state to go on from, the
@@ -13,6 +13,7 @@ import json
 import pathlib
 import sys
 import time
+from collections.abc import Callable
 from typing import Literal
 
 import jax
@@ -23,12 +24,13 @@ import tyro
 from tqdm import tqdm
 
 from experiments.ablations import ABLATIONS
-from jscomb import exr
-from jscomb.learning import files, training
+from jscomb import exr, metrics
+from jscomb.learning import files, methods, training
 from jscomb.learning.methods import DENOISERS, METHODS
+from jscomb.typing import Image, Scalar
 
 ALL = METHODS | DENOISERS | ABLATIONS
-QUICK = training.Schedule(steps=30, batch=2, crop=48)
+QUICK = training.Schedule(steps=60, batch=4, crop=48)
 SAVE_EVERY = 60.0  # seconds
 
 
@@ -38,7 +40,8 @@ class Config:
 
     Attributes:
         method: whose network: njs, dsc, pd, kernels (a denoiser), kernels-njs (both,
-            jointly), or an ablation: pd-no-sure, pd-direct.
+            jointly), or an ablation: njs-equal, pd-smape, dsc-log,
+            pd-no-sure, pd-direct.
         data: folder of frames by `experiments.dataset`.
         out: folder of the run.
         size: light or full.
@@ -126,11 +129,14 @@ def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
     )
 
 
-def objective(method: str) -> training.Objective:
+def objective(
+    method: str, *, loss: Callable[[Image, Image], Scalar] | None = None
+) -> training.Objective:
     """The loss of a method's network on one frame.
 
     Args:
         method: a key of `ALL`.
+        loss: of an image and a reference; None for the method's own.
 
     Returns:
         of network, inputs, reference and exposure; in units of that exposure.
@@ -140,11 +146,13 @@ def objective(method: str) -> training.Objective:
     # training half of them are not.
     options = {"bound": False} if method.startswith("pd") else {}
 
-    def loss(network, inputs, reference, exposure):
-        image = chosen.combine(network, inputs, exposure=exposure, **options)
-        return chosen.loss(image / exposure, reference / exposure)
+    measure = loss or chosen.loss
 
-    return loss
+    def of_frame(network, inputs, reference, exposure):
+        image = chosen.combine(network, inputs, exposure=exposure, **options)
+        return measure(image / exposure, reference / exposure)
+
+    return of_frame
 
 
 def run(config: Config) -> dict:
@@ -199,8 +207,21 @@ def run(config: Config) -> dict:
             saved = time.monotonic()
             _save(config.out, now, about, history)
     bar.close()
-    print(f"{config.out}: {(time.monotonic() - since) / 60:.1f} min")
-    return json.loads((config.out / "network.json").read_text())
+    card = json.loads((config.out / "network.json").read_text())
+    network = files.load(config.out / "network.safetensors", network)
+    card["relative_l2"] = _relative_l2(config.method, network, held)
+    _write_card(config.out, card)
+    print(f"{config.out}: {(time.monotonic() - since) / 60:.1f} min", end=", ")
+    print(f"relative L2 of held-out frames {card['relative_l2']:.5f}")
+    return card
+
+
+def _relative_l2(
+    method: str, network: methods.Network, held: training.Examples
+) -> float:
+    """Geometric mean over frames: what networks of unlike losses are compared by."""
+    images = objective(method, loss=metrics.rel_l2)
+    return float(jnp.exp(jnp.log(training.evaluate(images, network, held)).mean()))
 
 
 def _resume(out: pathlib.Path, about: dict) -> dict:
@@ -218,10 +239,7 @@ def _save(out: pathlib.Path, state: training.State, about: dict, losses: dict) -
     """The network, its card, the state to go on from, and a plot."""
     files.save(out / "state.safetensors", state)
     files.save(out / "network.safetensors", state.network)
-    card = about | {"steps": int(state.step), "losses": losses}
-    temporary = out / "network.json.tmp"
-    temporary.write_text(json.dumps(card, indent=1))
-    temporary.replace(out / "network.json")
+    _write_card(out, about | {"steps": int(state.step), "losses": losses})
     figure, axes = plt.subplots(figsize=(6, 4))
     axes.plot(losses["step"][1:], losses["train"][1:], label="training")
     axes.plot(losses["step"], losses["validation"], label="validation")
@@ -229,6 +247,13 @@ def _save(out: pathlib.Path, state: training.State, about: dict, losses: dict) -
     axes.legend()
     figure.savefig(out / "losses.png", dpi=120)
     plt.close(figure)
+
+
+def _write_card(out: pathlib.Path, card: dict) -> None:
+    """At once or not at all."""
+    temporary = out / "network.json.tmp"
+    temporary.write_text(json.dumps(card, indent=1))
+    temporary.replace(out / "network.json")
 
 
 def main() -> None:

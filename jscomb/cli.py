@@ -33,7 +33,7 @@ Path = pathlib.Path
 _Frame = tyro.conf.Positional[Path]
 _Samples = Annotated[int | None, tyro.conf.arg(metavar="N")]
 _Biased = Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")]
-_Method = Literal["auto", "whitened", "james-stein"]
+_Method = Literal["auto", "whitened", "james-stein", "njs", "dsc", "pd"]
 TIMED_RUNS = 7
 _DEMO_FOLDER = Path("jscomb-demo")
 
@@ -53,6 +53,7 @@ METHODS: dict[str, Callable[[Image, Image, Variance], Image]] = {
     "james-stein": _james_stein,
     "whitened": _whitened,
 }
+LEARNED = ("njs", "dsc", "pd")
 KEEP = "kept"  # what `auto` does with a biased image that it cannot better
 
 
@@ -139,9 +140,11 @@ def combine(
         out: EXR file to write.
         biased: EXR file of the biased image, or its name within the frame. By default
             the frame's only one; a frame without any is denoised by Open Image Denoise.
-        method: whitened, or james-stein as in the paper without its network; auto is
-            whitened where the half buffers show that it lowers the error, or there are
-            none, else the biased image as it is.
+        method: whitened, or james-stein as in the paper without its network; by a
+            trained network njs (James-Stein), dsc (double shrinkage, needs halves) or
+            pd (progressive, needs Open Image Denoise); auto is whitened where the half
+            buffers show that it lowers the error, or there are none, else the biased
+            image as it is.
         samples: samples a pixel, where the file does not say.
     """
     path, loaded = frame, exr.read_frame(frame, samples=samples)
@@ -152,7 +155,9 @@ def combine(
     name, image = _biased_image(path, loaded, biased)
     chosen = _choose(loaded, image) if method == "auto" else method
     combined = image.full
-    if chosen != KEEP:
+    if chosen in LEARNED:
+        combined = _learned(path, loaded.with_biased(name, image), name, chosen)
+    elif chosen != KEEP:
         combined = jax.jit(METHODS[chosen])(loaded.color, image.full, variance)
     about = {
         "jscomb": jscomb.__version__,
@@ -307,6 +312,16 @@ def _choose(frame: Frame, biased: Biased) -> str:
     mean, error = map(float, change)
     print(f"by the half buffers, whitened adds {mean:+.2g} +- {error:.1g} relative L2")
     return "whitened" if change.helps else KEEP
+
+
+def _learned(path: Path, frame: Frame, name: str, method: str) -> Image:
+    """Combined by a trained network."""
+    from jscomb.learning import methods  # flax is slow to import
+
+    try:
+        return methods.combine_frame(jax.random.key(0), frame, name, method=method)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Biased]:

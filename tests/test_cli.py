@@ -54,7 +54,7 @@ def test_demo(jscomb, tmp_path):
     assert os.fspath((tmp_path / "demo").resolve()) in out
 
 
-@pytest.mark.parametrize("method", ["auto", "james-stein", "whitened"])
+@pytest.mark.parametrize("method", ["auto", "james-stein", "whitened", *cli.LEARNED])
 def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     path = tmp_path / "out.exr"
     status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)

@@ -1,5 +1,6 @@
 """The experiments run, on small input, and say what they measured."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,13 +15,17 @@ from experiments import (
     frames,
     james_stein_error,
     james_stein_speed,
+    learned,
+    learned_speed,
     regression_error,
     speed_error,
     uncorrelated,
 )
 from jscomb import exr, metrics
 from jscomb.cli import METHODS
+from jscomb.denoisers import oidn
 from jscomb.frame import CHANNELS
+from jscomb.learning import methods, networks
 
 BOX = """<scene version="3.0.0">
   <integrator type="path"/>
@@ -223,3 +228,32 @@ def test_scores_are_ranks():
     """The best of three candidates scores 3, the worst 1; means over the frames."""
     rows = [{"a": 0.1, "b": 0.2, "c": 0.3}, {"a": 9.0, "b": 1.0, "c": 5.0}]
     assert ensemble.scores(rows, ["a", "b", "c"]) == {"b": 2.5, "a": 2.0, "c": 1.5}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+def test_networks_are_measured_beside_the_rest(folder, glass_frame):
+    rows = learned.run(learned.Config(folder, quick=True))
+    errors = rows["glass", 64]
+    assert {"path tracing", "oidn", "whitened", "njs", "dsc", "pd"} <= errors.keys()
+    image = methods.combine_frame(jax.random.key(0), glass_frame, "oidn", method="dsc")
+    r, noise = (i / glass_frame.exposure for i in glass_frame.reference)
+    image = image / glass_frame.exposure
+    expected = metrics.rel_l2(image, r, half_difference=noise)
+    np.testing.assert_allclose(errors["dsc"], expected, rtol=1e-3)
+    table = learned.summary(rows)
+    np.testing.assert_allclose(
+        table["njs"]["64"], errors["njs"] / errors["oidn"], rtol=1e-6
+    )
+    assert table["oidn"] == {"64": 1.0, "worst": 1.0}
+
+
+def test_the_cost_of_networks_is_their_convolutions():
+    costs = learned_speed.run(learned_speed.Config(quick=True))
+    assert all(cost.seconds > 0 for cost in costs.values())
+    assert 0 < costs["njs light"].memory < 2000
+    # 5x5 of 18 to 48, four 3x3 of 48, 3x3 of 48 to 9: twice a multiplication.
+    network = networks.MixingNetwork(jax.random.key(0))
+    full = 2 * (25 * 18 * 48 + 4 * 9 * 48 * 48 + 9 * 48 * 9)
+    assert learned_speed.operations(network) == full
+    assert costs["pd light"].operations < full / 3

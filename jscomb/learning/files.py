@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -66,7 +65,7 @@ def load(path: pathlib.Path, like: Tree) -> Tree:
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
-def _named(tree: Any) -> list[tuple[str, Array]]:
+def _named(tree: Any) -> list[tuple[str, Any]]:
     """The leaves with their names, such as body/down/0/1/kernel/value."""
     leaves, _ = jax.tree.flatten_with_path(tree)
     return [

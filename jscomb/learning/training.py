@@ -33,9 +33,9 @@ class Schedule:
         seed: of the parameters and of all draws.
     """
 
-    steps: int = 3000
-    batch: int = 4
-    crop: int = 128
+    steps: int = 2000
+    batch: int = 12
+    crop: int = 64
     rate: float = 1e-3
     jitter: float = 1.0
     seed: int = 0
@@ -117,7 +117,10 @@ def run(
             objective, network, keys, examples, schedule
         )
         value, gradient = jax.value_and_grad(of_network)(state.network)
-        updates, moments = optimiser.update(gradient, state.optimiser, state.network)
+        with jax.numpy_dtype_promotion("standard"):  # optax counts in integers
+            updates, moments = optimiser.update(
+                gradient, state.optimiser, state.network
+            )
         network = optax.apply_updates(state.network, updates)
         return State(network, moments, state.step + 1), value
 
@@ -187,7 +190,7 @@ def draw(
 def _batch_loss(
     objective: Objective,
     network: Network,
-    keys: Key,
+    keys: Array,
     examples: Examples,
     schedule: Schedule,
 ) -> Scalar:
