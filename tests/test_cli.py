@@ -204,7 +204,7 @@ def test_help_reads_well(jscomb):
         assert status == 0
         assert "usage: jscomb" in out
         assert "{None}" not in out
-    assert "{auto,whitened,james-stein}" in jscomb("combine", "--help")[1]
+    assert "{auto,whitened,james-stein,njs,dsc,pd}" in jscomb("combine", "--help")[1]
 
 
 def truncated(folder):
