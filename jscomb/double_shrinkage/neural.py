@@ -54,7 +54,7 @@ def neural_combine(
         biased: b, likewise.
         variance: sample variance v of the mean u, mean over channels, squared radiance,
             at least zero, shape [H,W,1].
-        mse: m, of b, likewise; single pixels' estimates will do.
+        mse: m, of b, likewise.
         window: width of the kernels in pixels, odd; the network's.
         exposure: what to divide radiance by; None for `numerics.exposure` of u.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from jscomb import double_shrinkage, james_stein, metrics, progressive
 from jscomb.denoisers import kernel_predicting, oidn
+from jscomb.features import stack
 from jscomb.frame import Frame
 from jscomb.learning import files, losses, networks
 from jscomb.numerics.sure import monte_carlo_sure
@@ -108,14 +109,14 @@ def _kernel_predicting(key: Key, frame: Frame, name: str) -> list[Inputs]:
     unit = frame.exposure
     if frame.albedo is None or frame.normal is None or frame.depth is None:
         raise ValueError("a kernel predictor needs albedo, normal and depth")
-    farthest = jnp.max(frame.depth, where=jnp.isfinite(frame.depth), initial=0.0)
+    albedo, normal, depth = jnp.split(stack(frame)[..., :7], [3, 6], axis=-1)
     return [
         {
             "noisy": frame.color / unit,
             "variance": frame.variance / jnp.square(unit),
-            "albedo": frame.albedo,
-            "normal": frame.normal,
-            "depth": frame.depth / jnp.where(farthest > 0, farthest, 1.0),
+            "albedo": albedo,
+            "normal": normal,
+            "depth": depth,
         }
     ]
 
