@@ -197,10 +197,7 @@ def plot_curves(runs: pathlib.Path, out: pathlib.Path) -> None:
     for ax in axes.flat[len(cards) :]:
         ax.axis("off")
     for ax, (name, card) in zip(axes.flat, cards.items(), strict=False):
-        losses = json.loads(card.read_text())["losses"]
-        ax.plot(losses["step"][1:], losses["train"][1:], label="training")
-        ax.plot(losses["step"], losses["validation"], label="validation")
-        ax.set(title=name, xlabel="step", ylabel="loss", yscale="log")
+        train.plot_losses(ax, json.loads(card.read_text())["losses"], title=name)
     axes[0, 0].legend()
     figure.tight_layout()
     figure.savefig(out, dpi=110)

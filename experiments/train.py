@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
 from tqdm import tqdm
 
 from experiments.ablations import ABLATIONS
@@ -216,6 +217,19 @@ def run(config: Config) -> dict:
     return card
 
 
+def plot_losses(axes: Axes, losses: dict[str, list], *, title: str) -> None:
+    """Losses of a run against its steps.
+
+    Args:
+        axes: to draw on.
+        losses: of a card.
+        title: of the plot.
+    """
+    axes.plot(losses["step"][1:], losses["train"][1:], label="training")
+    axes.plot(losses["step"], losses["validation"], label="validation")
+    axes.set(xlabel="step", ylabel="loss", yscale="log", title=title)
+
+
 def _relative_l2(
     method: str, network: methods.Network, held: training.Examples
 ) -> float:
@@ -241,9 +255,7 @@ def _save(out: pathlib.Path, state: training.State, about: dict, losses: dict) -
     files.save(out / "network.safetensors", state.network)
     _write_card(out, about | {"steps": int(state.step), "losses": losses})
     figure, axes = plt.subplots(figsize=(6, 4))
-    axes.plot(losses["step"][1:], losses["train"][1:], label="training")
-    axes.plot(losses["step"], losses["validation"], label="validation")
-    axes.set(xlabel="step", ylabel="loss", yscale="log", title=about["method"])
+    plot_losses(axes, losses, title=about["method"])
     axes.legend()
     figure.savefig(out / "losses.png", dpi=120)
     plt.close(figure)

@@ -9,14 +9,10 @@ Sizes: "full" is the paper's, "light" has half the channels and a quarter of the
 Away from the papers: radiance enters as log(1 + |.|) with its sign and variance as
 log(1 + ./0.01), since beside a firefly of 1e6 a network sees nothing else.
 
-Convolutions are XLA's own, fast on a CPU but for their derivative in the kernel. That
-is a matrix product of patches here, some rows at a time: two or three times as fast.
-
 Sources: see the combiners; M. Kettunen, E. Harkonen, J. Lehtinen, "Deep convolutional
 reconstruction for gradient-domain rendering", 2019 (the signed logarithm).
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -24,14 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import lax
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jscomb.double_shrinkage.neural import Filters
 from jscomb.james_stein.neural import Parameters
+from jscomb.numerics.convolution import convolve
 from jscomb.numerics.kernels import Kernels
-from jscomb.numerics.tiles import map_rows
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Key, Variance
 
@@ -42,7 +36,6 @@ _MIXING_WIDTH = {"full": 48, "light": 24}
 _LEAST_WEIGHT = 1e-4  # NJS's, added to its weights
 _LARGEST_EXPONENT = 30.0  # of a confidence: beyond it there is no prior
 _VARIANCE_UNIT = 0.01  # squared radiance at an exposure of one
-_PATCH_ROWS = 8  # at once in the derivative in the kernel
 
 
 def compress(image: Array) -> Array:
@@ -98,54 +91,7 @@ class Convolution(nnx.Module):
         """
         kernel, bias = (p[...].astype(image.dtype) for p in (self.kernel, self.bias))
         rows = 0 if inner else self.reach
-        return _convolve(image, kernel, rows) + bias.reshape(1, 1, -1)
-
-
-def _xla_convolve(image: Array, kernel: Array, rows: int) -> Array:
-    """XLA's convolution with that many rows of zeros above and below."""
-    r = kernel.shape[0] // 2
-    return lax.conv_general_dilated(
-        image[None],
-        kernel,
-        window_strides=(1, 1),
-        padding=((rows, rows), (r, r)),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-    )[0]
-
-
-_convolve = jax.custom_jvp(_xla_convolve, nondiff_argnums=(2,))
-
-
-@functools.partial(_convolve.defjvp, symbolic_zeros=True)
-def _convolve_jvp(rows: int, primals, tangents) -> tuple[Array, Array]:
-    """Linear in both; the part in the kernel so that its transpose is fast."""
-    (image, kernel), (moved, changed) = primals, tangents
-    result = _convolve(image, kernel, rows)
-    parts = []
-    if not isinstance(moved, SymbolicZero):
-        parts.append(_xla_convolve(moved, kernel, rows))
-    if not isinstance(changed, SymbolicZero):
-        parts.append(_patch_convolve(image, changed, rows))
-    return result, sum(parts, start=jnp.zeros_like(result))
-
-
-def _patch_convolve(image: Array, kernel: Array, rows: int) -> Array:
-    """The same as a product of patches and the kernel, a strip of rows at a time."""
-    size, _, inputs, outputs = kernel.shape
-    r, (height, width, _) = size // 2, image.shape
-    matrix = kernel.reshape(size * size * inputs, outputs)
-
-    def strip(near: Array) -> Array:
-        near = jnp.pad(near, ((0, 0), (r, r), (0, 0)))
-        taps = [(i, j) for i in range(size) for j in range(size)]
-        n = near.shape[0] - 2 * r
-        patches = [near[i : i + n, j : j + width] for i, j in taps]
-        return jnp.concatenate(patches, axis=-1) @ matrix
-
-    if rows > r:
-        raise ValueError(f"a kernel of {size} wants at most {r} rows, got {rows}")
-    result = map_rows(strip, [(image, r)], rows=_PATCH_ROWS)
-    return result[r - rows : height - (r - rows)]
+        return convolve(image, kernel, rows=rows) + bias.reshape(1, 1, -1)
 
 
 class UNet(nnx.Module):
