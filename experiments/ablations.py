@@ -1,6 +1,5 @@
 """Methods with something left out, to be trained like the others."""
 
-import jax
 import jax.numpy as jnp
 
 from jscomb import james_stein, metrics, progressive
@@ -17,16 +16,9 @@ def _no_sure(key, frame, name):
     return [taken | {"sure": s}, exchanged]
 
 
-def _direct(network, inputs, **options):
-    """PD with a sigmoid of one output in place of the form of its equation 9."""
-
-    def outputs(*images):
-        share = jax.nn.sigmoid(network(*images)[:, :, :1])
-        return jnp.concatenate(
-            [share, jnp.zeros_like(share), jnp.ones_like(share)], axis=2
-        )
-
-    return progressive.neural_combine(outputs, **inputs, **options)
+def _quotient(network, inputs, **options):
+    """PD as in its paper: alpha in the form of its equation 9, and its bound."""
+    return progressive.neural_combine(network, **inputs, **options)
 
 
 def _equal(network, inputs, **options):
@@ -34,12 +26,14 @@ def _equal(network, inputs, **options):
     return james_stein.neural_combine(network, **inputs, **options)
 
 
+_PD = METHODS["pd"]._replace(combine=_quotient)
+
 ABLATIONS: dict[str, methods.Method] = {
     "njs-equal": METHODS["njs"]._replace(combine=_equal),
-    "pd-smape": METHODS["pd"]._replace(loss=metrics.smape),
     "dsc-log": METHODS["dsc"]._replace(loss=losses.log_l2),
-    "pd-no-sure": METHODS["pd"]._replace(variants=_no_sure),
-    "pd-direct": METHODS["pd"]._replace(combine=_direct),
+    "pd-quotient": _PD,
+    "pd-smape": _PD._replace(loss=metrics.smape),
+    "pd-no-sure": _PD._replace(variants=_no_sure),
 }
-"""njs-equal and pd-smape are as in the papers; pd-no-sure and pd-direct are of PD's
+"""njs-equal and pd-smape are as in the papers; pd-quotient and pd-no-sure are of PD's
 table 4, whose third, without the bound, trains nothing."""

@@ -23,7 +23,7 @@ import tyro
 
 from experiments import frames, train
 from jscomb import double_shrinkage, james_stein, progressive
-from jscomb.cli import METHODS as UNTRAINED
+from jscomb.choice import UNTRAINED
 from jscomb.frame import Frame
 from jscomb.learning import methods
 from jscomb.metrics import rel_l2
@@ -98,7 +98,8 @@ def measure_network(
         regressed, plain = map(jax.jit(combine), _james_stein_inputs(frame))
         images |= {", always regressed": regressed, ", never regressed": plain}
     if method.startswith("pd"):
-        images[", no bound"] = jax.jit(functools.partial(combine, bound=False))(taken)
+        for name, bound in ((", bound", True), (", no bound", False)):
+            images[name] = jax.jit(functools.partial(combine, bound=bound))(taken)
     if method == "kernels-njs":
         images[", its denoiser"] = methods.DENOISERS["kernels"].combine(
             network.denoiser, taken

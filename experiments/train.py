@@ -41,8 +41,8 @@ class Config:
 
     Attributes:
         method: whose network: njs, dsc, pd, kernels (a denoiser), kernels-njs (both,
-            jointly), or an ablation: njs-equal, pd-smape, dsc-log,
-            pd-no-sure, pd-direct.
+            jointly), or an ablation: njs-equal, dsc-log, pd-quotient, pd-smape,
+            pd-no-sure.
         data: folder of frames by `experiments.dataset`.
         out: folder of the run.
         size: light or full.

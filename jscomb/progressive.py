@@ -29,6 +29,7 @@ Rendered Images", 2022 (PD; eq. numbers below).
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
@@ -100,6 +101,7 @@ def neural_combine(
     variance: Variance,
     sure: Image,
     *,
+    activate: Callable[[Float[Array, "h w 3 c"]], Image] | None = None,
     bound: bool = True,
     exposure: Scalar | None = None,
 ) -> Image:
@@ -109,12 +111,14 @@ def neural_combine(
     parameters.
 
     Args:
-        network: of x, y, v and s, finite and at an exposure of one, to what
-            `activation` takes, such as `learning.networks.MixingNetwork`.
+        network: of x, y, v and s, finite and at an exposure of one, to what `activate`
+            takes, such as `learning.networks.MixingNetwork`.
         unbiased: x, linear radiance, shape [H,W,C].
         biased: y, likewise.
         variance: v of the mean x, squared radiance, at least zero, likewise.
         sure: s, squared radiance, likewise.
+        activate: alpha from the outputs: `activation`, which is taken for None, or
+            `direct_activation`.
         bound: take alpha back where it is not consistent with the noise.
         exposure: what to divide radiance by; None for `numerics.exposure` of x.
 
@@ -132,7 +136,7 @@ def neural_combine(
 
     def mix(x: Image, y: Image, v: Variance, s: Image) -> Image:
         _, x, y, v, s = in_units(exposure, valid, x, y, variance=v, sure=s)
-        return activation(network(x, y, v, s))
+        return (activate or activation)(network(x, y, v, s))
 
     return combine(unbiased, biased, variance, sure, mix=mix, bound=bound)
 
@@ -230,6 +234,20 @@ def activation(outputs: Float[Array, "h w 3 c"]) -> Image:
     """
     first, second, third = (outputs[:, :, k] for k in range(3))
     return jnp.clip((first - second) / jnp.maximum(third, 1e-6), 0.0, 1.0)
+
+
+def direct_activation(outputs: Float[Array, "h w 3 c"]) -> Image:
+    """Alpha from the first output alone, without the form of eq. 9.
+
+    Args:
+        outputs: xi_1 and two that do not count, shape [H,W,3,C].
+
+    Returns:
+        the logistic function of xi_1, shape [H,W,C].
+
+    Source: PD table 4, which finds it worse; trained on our frames it is better.
+    """
+    return jax.nn.sigmoid(outputs[:, :, 0])
 
 
 def bound_mixing(

@@ -264,11 +264,11 @@ def test_frames_without_a_reference_are_refused(tmp_path, glass_frame):
 
 
 def test_only_a_run_of_the_method_is_shipped(tmp_path):
-    card = {"method": "pd-direct", "size": "light", "steps": 3, "schedule": {}}
+    card = {"method": "pd-smape", "size": "light", "steps": 3, "schedule": {}}
     run = tmp_path / "run"
     run.mkdir()
     (run / "network.json").write_text(json.dumps(card))
     config = ship.Config("pd", run, tmp_path, out=tmp_path / "weights")
-    with pytest.raises(ValueError, match="is a run of pd-direct"):
+    with pytest.raises(ValueError, match="is a run of pd-smape"):
         ship.run(config)
     assert not config.out.exists()

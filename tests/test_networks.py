@@ -176,6 +176,15 @@ NETWORKS = {
         networks.MixingNetwork,
         lambda n, x, y, v: progressive.neural_combine(n, x, y, v, v / 2),
     ),
+    "pd, direct": (
+        networks.MixingNetwork,
+        lambda n, x, y, v: progressive.neural_combine(
+            n,
+            *(x, y, v, v / 2),
+            activate=progressive.direct_activation,
+            bound=False,
+        ),
+    ),
     "kernels": (
         networks.KernelPredictor,
         lambda n, x, y, v: kernel_predicting.denoise(

@@ -138,6 +138,8 @@ def test_activation():
     one, two, three = np.moveaxis(np.asarray(outputs), 2, 0)
     expected = np.clip((one - two) / np.maximum(three, 1e-6), 0, 1)
     np.testing.assert_allclose(found, expected)
+    direct = progressive.direct_activation(outputs)
+    np.testing.assert_allclose(direct, 1 / (1 + np.exp(-one)))
 
 
 def test_a_network_may_mix():

@@ -165,12 +165,19 @@ METHODS = {
     "pd": Method(
         networks.MixingNetwork,
         _progressive,
-        _of_arrays(progressive.neural_combine),
+        _of_arrays(
+            functools.partial(
+                progressive.neural_combine,
+                activate=progressive.direct_activation,
+                bound=False,
+            )
+        ),
         losses.log_l2,
     ),
 }
 """The combiners whose trained parameters come with the package. Away from the papers,
-as it measured better when both were trained: njs has the whitened rule, pd NJS's loss.
+as it measured better when both were trained: njs has the whitened rule; pd NJS's loss,
+alpha as one output of the network, and no bound.
 """
 
 DENOISERS = {
