@@ -12,13 +12,12 @@ import dataclasses
 import pathlib
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from experiments import frames
-from jscomb import james_stein
-from jscomb.cli import METHODS, estimated_change
+from jscomb import choice, james_stein
+from jscomb.choice import UNTRAINED
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
@@ -52,10 +51,11 @@ def images_of(frame: Frame) -> dict[str, Image]:
     """Inputs and combinations by name."""
     y = frame.biased["oidn"].full
     combined = {
-        name: method(frame.color, y, frame.variance) for name, method in METHODS.items()
+        name: method(frame.color, y, frame.variance)
+        for name, method in UNTRAINED.items()
     }
-    change = estimated_change(frame, frame.biased["oidn"], "whitened")
-    chosen = jnp.where(change.helps, combined["whitened"], y)
+    found = choice.choose(frame, name="oidn", methods=[choice.KEEP, "whitened"])
+    chosen = combined["whitened"] if found.method == "whitened" else y
     inputs = {"path tracing": frame.color, "oidn": y}
     return inputs | combined | {"auto": chosen, "dual": _dual(frame)}
 
@@ -80,7 +80,7 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
         images = jax.jit(images_of)(frame)  # comes back sorted by name
         found[path.stem, samples] = {
             name: float(rel_l2(images[name], r, half_difference=noise))
-            for name in (*INPUTS, *METHODS, "auto", "dual")
+            for name in (*INPUTS, *UNTRAINED, "auto", "dual")
         }
     return found
 

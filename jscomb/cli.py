@@ -17,70 +17,25 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
 import jscomb
-from jscomb import exr, james_stein, metrics
+from jscomb import choice, exr, metrics
 from jscomb.denoisers import oidn
 from jscomb.exr import dialects
 from jscomb.frame import Biased, Frame, Reference
 from jscomb.numerics.guards import finite
-from jscomb.typing import Image, Variance
+from jscomb.typing import Image
 
 Path = pathlib.Path
 _Frame = tyro.conf.Positional[Path]
 _Samples = Annotated[int | None, tyro.conf.arg(metavar="N")]
 _Biased = Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")]
-_Method = Literal["auto", "whitened", "james-stein", "njs", "dsc", "pd"]
+_Budget = Annotated[float | None, tyro.conf.arg(metavar="SECONDS")]
+_Method = Literal["auto", "kept", "james-stein", "whitened", "njs", "pd", "dsc"]
 TIMED_RUNS = 7
 _DEMO_FOLDER = Path("jscomb-demo")
-
-
-def _james_stein(x: Image, y: Image, variance: Variance) -> Image:
-    """As in the paper without its network: 15x15 windows, box-filtered variance."""
-    return james_stein.combine(x, y, james_stein.smooth_variance(variance))
-
-
-def _whitened(x: Image, y: Image, variance: Variance) -> Image:
-    """A variance for each pixel, made robust, and windows of 7x7."""
-    robust = james_stein.robust_variance(variance)
-    return james_stein.combine(x, y, robust, window=7, whiten=True)
-
-
-METHODS: dict[str, Callable[[Image, Image, Variance], Image]] = {
-    "james-stein": _james_stein,
-    "whitened": _whitened,
-}
-LEARNED = ("njs", "dsc", "pd")
-KEEP = "kept"  # what `auto` does with a biased image that it cannot better
-
-
-def estimated_change(frame: Frame, biased: Biased, method: str) -> metrics.Change:
-    """Relative L2 that a method would add to a biased image, from half buffers alone.
-
-    Args:
-        frame: with sub-buffers, and halves of the biased image.
-        biased: the biased image with its halves.
-        method: a key of `METHODS`.
-
-    Returns:
-        the change, scale-invariant.
-
-    Raises:
-        ValueError: if the frame or the biased image has no halves.
-    """
-    halves = frame.halves()
-    y = biased.halves
-    if y is None:
-        raise ValueError("the biased image was not made from each half too")
-    x = jnp.stack([half.color for half in halves])
-    z = jnp.stack(
-        [METHODS[method](h.color, y[n], h.variance) for n, h in enumerate(halves)]
-    )
-    # Relative to the frame: pixels darker than is typical of it do not decide.
-    return metrics.rel_l2_change(z, y, x, epsilon=jnp.square(frame.exposure))
 
 
 def demo(*, out: Path = _DEMO_FOLDER) -> None:
@@ -99,26 +54,19 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     by_samples = sorted(frames.items(), key=lambda item: float(item[1].samples or 0))
     table, shown, ms = {}, [], {}
     for name, frame in by_samples:
-        denoised = frame.biased["oidn"].full
-        combined = {}
-        for method, function in METHODS.items():
-            inputs = frame.color, denoised, frame.variance
-            combined[method], time_of_one = _timed(jax.jit(function), *inputs)
-            ms[method] = f"{time_of_one:.2f}"
-            exr.write_image(out / f"{name}-{method}.exr", combined[method])
-        if oidn.available():
-            guides = {"albedo": frame.albedo, "normal": frame.normal}
-            denoise = functools.partial(oidn.denoise, **guides)
-            ms["Open Image Denoise"] = f"{_timed(denoise, frame.color)[1]:.2f}"
-        images = {"path tracing": frame.color, "Open Image Denoise": denoised}
-        table[f"{_samples(frame)} spp"] = _errors(images | combined, frame)
-        shown.append((frame, combined))
+        spp = f"{_samples(frame)} spp"
+        print(f"{spp}:")
+        chosen = _choose(frame, "oidn", None)
+        combined, ms = _all_methods(frame)
+        for method, image in combined.items():
+            exr.write_image(out / f"{name}-{method}.exr", image)
+        images = {"path tracing": frame.color, **combined, "chosen": combined[chosen]}
+        table[spp] = _errors(images, frame)
+        shown.append((frame, {f"chosen: {chosen}": combined[chosen]}))
     size = _size(by_samples[0][1])
     print(f"relative L2 of one scene, {size}, and the time of each step")
     _print_table({**table, "ms": ms})
-    print(
-        "This scene suits a combination; at few samples others are best left denoised."
-    )
+    print("kept is the image by Open Image Denoise, and its time.")
     picture = out / "comparison.png"
     plots.comparison(picture, shown)
     print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
@@ -131,6 +79,7 @@ def combine(
     *,
     biased: _Biased = None,
     method: _Method = "auto",
+    budget: _Budget = None,
     samples: _Samples = None,
 ) -> None:
     """Combine a path-traced frame with a biased image into one better image.
@@ -140,25 +89,27 @@ def combine(
         out: EXR file to write.
         biased: EXR file of the biased image, or its name within the frame. By default
             the frame's only one; a frame without any is denoised by Open Image Denoise.
-        method: whitened, or james-stein as in the paper without its network; by a
-            trained network njs (James-Stein), dsc (double shrinkage, needs halves) or
-            pd (progressive, needs Open Image Denoise); auto is whitened where the half
-            buffers show that it lowers the error, or there are none, else the biased
-            image as it is.
+        method: kept, the biased image as it is; whitened, or james-stein as in the
+            paper without its network; by a trained network njs (James-Stein), dsc
+            (double shrinkage, needs halves) or pd (progressive, needs Open Image
+            Denoise); auto is the one of least error by the half buffers, and whitened
+            where there are none.
+        budget: seconds that the method of auto may take; any by default.
         samples: samples a pixel, where the file does not say.
     """
     path, loaded = frame, exr.read_frame(frame, samples=samples)
     try:
-        variance = loaded.variance
+        _ = loaded.variance
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     name, image = _biased_image(path, loaded, biased)
-    chosen = _choose(loaded, image) if method == "auto" else method
-    combined = image.full
-    if chosen in LEARNED:
-        combined = _learned(path, loaded.with_biased(name, image), name, chosen)
-    elif chosen != KEEP:
-        combined = jax.jit(METHODS[chosen])(loaded.color, image.full, variance)
+    whole = loaded.with_biased(name, image)
+    chosen = _choose(whole, name, budget) if method == "auto" else method
+    key = jax.random.key(0)
+    try:
+        combined = choice.combine(key, whole, name, method=chosen)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     about = {
         "jscomb": jscomb.__version__,
         "method": chosen,
@@ -302,26 +253,43 @@ def _bundled() -> list[Path]:
     return [Path(str(f)) for f in folder.iterdir() if f.name.endswith(".exr")]
 
 
-def _choose(frame: Frame, biased: Biased) -> str:
-    """A method where the half buffers say that it helps, else to keep the image."""
-    if frame.sub_buffers < 2 or biased.halves is None:
+def _all_methods(frame: Frame) -> tuple[dict[str, Image], dict[str, str]]:
+    """Combinations of a denoised frame, and the milliseconds that each takes."""
+    images, ms = {}, {}
+    for method in choice.METHODS:
+        make = lambda frame, method=method: choice.combine(
+            jax.random.key(0), frame, "oidn", method=method
+        )
+        try:
+            images[method], time_of_one = _timed(make, frame)
+        except ImportError as error:
+            print(f"{method}: {error}")
+            continue
+        ms[method] = f"{time_of_one:.1f}"
+    if oidn.available():
+        guides = {"albedo": frame.albedo, "normal": frame.normal}
+        denoise = functools.partial(oidn.denoise, **guides)
+        ms[choice.KEEP] = f"{_timed(denoise, frame.color)[1]:.1f}"
+    return images, ms
+
+
+def _choose(frame: Frame, name: str, budget: float | None) -> str:
+    """The method that the half buffers choose; says why."""
+    found = choice.choose(frame, name=name, budget=budget)
+    if not found.trials:
         print("without half buffers of both images it is not known whether this helps")
-        return "whitened"
-    estimate = jax.jit(estimated_change, static_argnames="method")
-    change = estimate(frame, biased, method="whitened")
-    mean, error = map(float, change)
-    print(f"by the half buffers, whitened adds {mean:+.2g} +- {error:.1g} relative L2")
-    return "whitened" if change.helps else KEEP
+    for trial in found.trials:
+        print(f"by the half buffers, {trial.method:<12}{_said(trial)}")
+    return found.method
 
 
-def _learned(path: Path, frame: Frame, name: str, method: str) -> Image:
-    """Combined by a trained network."""
-    from jscomb.learning import methods  # flax is slow to import
-
-    try:
-        return methods.combine_frame(jax.random.key(0), frame, name, method=method)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+def _said(trial: choice.Trial) -> str:
+    """What was found out about a method, in a line."""
+    if trial.change is None:
+        return f"is not known: {trial.reason}"
+    mean, error = map(float, trial.change)
+    late = f", but {trial.reason}" if trial.reason else ""
+    return f"adds {mean:+.2g} +- {error:.1g} relative L2{late}"
 
 
 def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Biased]:
@@ -351,7 +319,7 @@ def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Bi
     return "oidn", oidn.denoise_frame(frame)
 
 
-def _timed(function: Callable, *inputs: Image) -> tuple[Image, float]:
+def _timed(function: Callable, *inputs: Any) -> tuple[Image, float]:
     """A result, and the median milliseconds of making it again."""
     result = jax.block_until_ready(function(*inputs))
     times = []

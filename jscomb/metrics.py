@@ -61,7 +61,7 @@ def rel_l2(
     Source: Rousselle et al. 2011; the form with the channels' mean is NJS's.
     """
     image, reference = _pair(image, reference, mask)
-    weight = jnp.square(jnp.mean(reference, axis=-1, keepdims=True)) + epsilon
+    weight = _grey_square(reference) + epsilon
     square = jnp.square(image - reference)
     if half_difference is not None:
         check_same_shape(reference=reference, half_difference=half_difference)
@@ -92,12 +92,13 @@ def rel_l2_change(
     unbiased: Float[Array, "2 h w c"],
     *,
     epsilon: Scalar | float = 0.01,
+    limit: float | None = None,
 ) -> Change:
     """Estimate from half buffers, without a reference, what a change does to the error.
 
     With z the candidate, y the baseline and x the unbiased image of independent halves,
 
-        (z_a - x_b)^2 - (y_a - x_b)^2 = (z_a - y_a) (z_a + y_a - 2 x_b),
+        (z_a - x_b)^2 - (y_a - x_b)^2 = 2 (z_a - y_a) ((z_a + y_a) / 2 - x_b),
 
     whose expectation over x_b is the difference of the true squared errors: the noise
     of x_b cancels. Both directions, averaged over the whole frame; a single pixel's
@@ -108,10 +109,13 @@ def rel_l2_change(
         baselines: y made from each half, likewise.
         unbiased: x of each half, likewise.
         epsilon: squared radiance that keeps black pixels from deciding, as in `rel_l2`.
+        limit: how far x counts as away from the middle of z and y, in units of their
+            radiance: so no firefly decides for the frame, but the estimate is biased,
+            towards the darker image where noise is skewed. None for an unbiased one.
 
     Returns:
-        relative L2 of the candidates less that of the baselines, relative to the
-        baselines' radiance. Unbiased, for images made from one half. The standard error
+        relative L2 of the candidates less that of the baselines, relative to the mean
+        radiance of both. Unbiased, for images made from one half. The standard error
         takes pixels as independent, and the spread of the true change over the frame
         for noise, so it is rather too large. Pixels that are not finite are left out;
         NaN if none is left.
@@ -123,8 +127,12 @@ def rel_l2_change(
     for half in (0, 1):
         z, y, x = candidates[half], baselines[half], unbiased[1 - half]
         check_same_shape(unbiased=x, candidates=z, baselines=y)
-        square = (z - y) * (z + y - 2 * x)
-        changes.append(mean_change(square, y, epsilon=epsilon))
+        middle = (z + y) / 2
+        if limit is not None:
+            reach = limit * _root(_grey_square(middle) + epsilon)
+            x = middle + jnp.clip(x - middle, -reach, reach)
+        square = 2 * (z - y) * (middle - x)
+        changes.append(mean_change(square, middle, epsilon=epsilon))
     means, errors = (jnp.stack(i) for i in zip(*changes, strict=True))
     return Change(jnp.mean(means), _root(jnp.sum(jnp.square(errors))) / 2)
 
@@ -148,7 +156,7 @@ def mean_change(
     check_same_shape(square=square, baseline=baseline)
     mask = finite(square, baseline)
     square, baseline = _masked(mask, square), _masked(mask, baseline)
-    weight = jnp.square(jnp.mean(baseline, axis=-1, keepdims=True)) + epsilon
+    weight = _grey_square(baseline) + epsilon
     change = jnp.mean(square / weight, axis=-1, keepdims=True)
     mean = _mean(change, mask)
     spread = _mean(jnp.square(change - mean), mask)
@@ -339,7 +347,12 @@ def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> flo
     return float(value)
 
 
-def _root(square: Scalar) -> Scalar:
+def _grey_square(image: Image) -> Array:
+    """Squared mean of a pixel's channels, [H,W,1]."""
+    return jnp.square(jnp.mean(image, axis=-1, keepdims=True))
+
+
+def _root(square: Array) -> Array:
     """Square root with derivative 0 at 0; NaN stays NaN."""
     exact = square == 0
     return jnp.where(exact, 0.0, jnp.sqrt(jnp.where(exact, 1.0, square)))

@@ -15,7 +15,7 @@ from jscomb import (
     progressive,
     uncorrelated,
 )
-from jscomb.cli import METHODS
+from jscomb.choice import UNTRAINED
 from jscomb.denoisers import smoothing
 from jscomb.learning import networks
 
@@ -59,7 +59,7 @@ COMBINERS = {
         0.9 * y, x, y, v, v / 2, v / 3
     ),
     "progressive": lambda x, y, v: progressive.combine(x, y, v, v / 2),
-    **{f"command, {name}": method for name, method in METHODS.items()},
+    **{f"command, {name}": method for name, method in UNTRAINED.items()},
 }
 
 

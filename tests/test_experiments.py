@@ -22,7 +22,7 @@ from experiments import (
     uncorrelated,
 )
 from jscomb import exr, metrics
-from jscomb.cli import METHODS
+from jscomb.choice import UNTRAINED
 from jscomb.denoisers import oidn
 from jscomb.frame import CHANNELS
 from jscomb.learning import methods, networks
@@ -78,7 +78,7 @@ def test_errors_are_those_of_the_metrics(folder, glass_frame):
         james_stein_error.Config(folder, quick=True)
     ).items()
     assert key == ("glass", 64)
-    assert errors.keys() == {"path tracing", "oidn", *METHODS, "auto", "dual"}
+    assert errors.keys() == {"path tracing", "oidn", *UNTRAINED, "auto", "dual"}
     r, noise = glass_frame.reference
     y = glass_frame.biased["oidn"].full
     expected = metrics.rel_l2(y, r, half_difference=noise)

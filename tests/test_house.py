@@ -26,6 +26,7 @@ ROOMS = [
     "double_shrinkage",
     "denoisers",
     "learning",
+    "choice",
     "exr",
     "plots",
     "cli",

@@ -127,6 +127,19 @@ def test_a_change_is_known_without_a_reference():
         assert not metrics.Change(-error.mean(), 2 * error.mean()).helps
 
 
+def test_a_limited_change_is_not_decided_by_a_firefly():
+    """Better everywhere; one firefly in x says the opposite, and louder."""
+    y, z = jnp.full((2, 2, 9, 9, 3), 1.5).at[1].set(1.1)
+    x = jnp.ones((2, 9, 9, 3))
+    exact = metrics.rel_l2_change(z, y, x)
+    np.testing.assert_allclose(metrics.rel_l2_change(z, y, x, limit=9.0), exact)
+    burnt = x.at[:, 4, 4].set(1e6)
+    assert metrics.rel_l2_change(z, y, burnt).mean > 0
+    limited = metrics.rel_l2_change(z, y, burnt, limit=2.0)
+    assert limited.mean < 0
+    np.testing.assert_allclose(limited.mean, exact.mean, rtol=0.2)
+
+
 def test_no_change_is_exactly_none_with_finite_derivatives():
     x, y = jax.random.uniform(jax.random.key(0), (2, 2, 5, 4, 3))
     change = metrics.rel_l2_change(y, y, x)
