@@ -5,7 +5,6 @@ Errors of the input are one line on standard error and exit status 2.
 
 import contextlib
 import functools
-import importlib.resources
 import io
 import os
 import pathlib
@@ -50,7 +49,7 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     from jscomb import plots  # matplotlib is slow to import
 
     out.mkdir(parents=True, exist_ok=True)
-    frames = {file.stem: exr.read_frame(file) for file in _bundled()}
+    frames = {name: exr.read_frame(file) for name, file in exr.bundled().items()}
     by_samples = sorted(frames.items(), key=lambda item: float(item[1].samples or 0))
     table, shown, ms = {}, [], {}
     for name, frame in by_samples:
@@ -245,12 +244,6 @@ def _use_compilation_cache() -> None:
         folder = os.path.join(cache, "jscomb", "xla")
         jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def _bundled() -> list[Path]:
-    """The frames that come with the package."""
-    folder = importlib.resources.files(jscomb) / "data"
-    return [Path(str(f)) for f in folder.iterdir() if f.name.endswith(".exr")]
 
 
 def _all_methods(frame: Frame) -> tuple[dict[str, Image], dict[str, str]]:

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import inspect
+import json
 import pathlib
 import pkgutil
 import re
@@ -129,3 +130,11 @@ def test_version_is_said_once_more_only_in_the_metadata():
 def _changelog() -> str:
     """The change log's text."""
     return (ROOT / "CHANGELOG.md").read_text()
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("notebooks/*")), ids=lambda p: p.name)
+def test_notebooks_have_no_outputs_and_end_in_an_assert(path):
+    cells = json.loads(path.read_text())["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    assert "assert" in "".join(code[-1]["source"])

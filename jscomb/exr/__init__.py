@@ -10,8 +10,10 @@ what is wrong with it. Writing is atomic: a file that was there is replaced only
 whole one.
 """
 
+import importlib.resources
 import json
 import os
+import pathlib
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,22 @@ from jscomb.exr import own
 from jscomb.exr.dialects import DIALECTS, recognise
 from jscomb.exr.files import Part, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
+
+
+def bundled() -> dict[str, pathlib.Path]:
+    """The frames that come with the package, to try things on.
+
+    Returns:
+        files by name: cornell-glass-64 and cornell-glass-1024, one scene path traced
+        with 64 and with 1024 samples a pixel, denoised, with features and a reference.
+
+    Example:
+        >>> print(sorted(bundled()))
+        ['cornell-glass-1024', 'cornell-glass-64']
+    """
+    folder = importlib.resources.files("jscomb") / "data"
+    files = [pathlib.Path(str(file)) for file in folder.iterdir()]
+    return {file.stem: file for file in files if file.suffix == ".exr"}
 
 
 def read_frame(
