@@ -2,10 +2,10 @@
 
     python -m experiments.james_stein_error FOLDER
 
-Every archive in the folder (see `frames`), at every sample count: relative L2, less the
-reference's noise, of path tracing, of Open Image Denoise, and of each combiner (`auto`
-combines only where the half buffers say that it helps); then the geometric mean over
-the frames of the ratio to the better of the two inputs.
+Every archive in the folder (see `frames`), at every sample count: relative L2 at an
+exposure of one, less the reference's noise, of path tracing, of Open Image Denoise, and
+of each combiner (`auto` combines only where the half buffers say that it helps); then
+the geometric mean over the frames of the ratio to the better of the two inputs.
 """
 
 import dataclasses
@@ -39,6 +39,7 @@ class Config:
 INPUTS = ("path tracing", "oidn")
 
 
+@jax.jit
 def _dual(frame: Frame) -> Image:
     """The dual variant: each half's x with the other half's y."""
     a, b = frame.halves()
@@ -75,9 +76,10 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
     found = {}
     for path, samples in frames.cases(config.folder, quick=config.quick):
         frame = frames.load(path, samples)
+        frame = frame.scaled(1 / frame.exposure)
         assert frame.reference is not None
         r, noise = frame.reference
-        images = jax.jit(images_of)(frame)  # comes back sorted by name
+        images = images_of(frame)
         found[path.stem, samples] = {
             name: float(rel_l2(images[name], r, half_difference=noise))
             for name in (*INPUTS, *UNTRAINED, "auto", "dual")

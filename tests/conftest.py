@@ -6,10 +6,12 @@ import pathlib
 import jax
 import jaxtyping
 import matplotlib as mpl
+import numpy as np
 import pytest
 
 from experiments import scenes
 from jscomb import exr
+from jscomb.frame import CHANNELS
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -50,3 +52,22 @@ def real_frame(request):
 def glass_frame():
     """The crop around the caustic, 64 samples a pixel."""
     return exr.read_frame(DATA / "cornell-glass-64.exr")
+
+
+@pytest.fixture
+def folder(glass_frame, tmp_path):
+    """An archive of one sample count, made of the crop."""
+    arrays = {
+        "reference": glass_frame.reference.image,
+        "reference_half_difference": glass_frame.reference.half_difference,
+        "full_oidn_32": glass_frame.biased["oidn"].full,
+    }
+    for name, half in zip("ab", glass_frame.halves(), strict=True):
+        arrays[f"{name}_color_32"] = half.color
+        arrays[f"{name}_variance_32"] = half.variance
+        arrays[f"{name}_oidn_32"] = half.biased["oidn"].full
+        for feature, channels in CHANNELS.items():
+            image = getattr(half, feature)
+            arrays[f"{name}_{feature}"] = image[..., 0] if channels == 1 else image
+    np.savez(tmp_path / "glass.npz", **arrays)
+    return tmp_path

@@ -24,7 +24,6 @@ from experiments import (
 from jscomb import exr, metrics
 from jscomb.choice import UNTRAINED
 from jscomb.denoisers import oidn
-from jscomb.frame import CHANNELS
 from jscomb.learning import methods, networks
 
 BOX = """<scene version="3.0.0">
@@ -42,25 +41,6 @@ BOX = """<scene version="3.0.0">
   <emitter type="constant"/>
 </scene>
 """
-
-
-@pytest.fixture
-def folder(glass_frame, tmp_path):
-    """An archive of one sample count, made of the crop."""
-    arrays = {
-        "reference": glass_frame.reference.image,
-        "reference_half_difference": glass_frame.reference.half_difference,
-        "full_oidn_32": glass_frame.biased["oidn"].full,
-    }
-    for name, half in zip("ab", glass_frame.halves(), strict=True):
-        arrays[f"{name}_color_32"] = half.color
-        arrays[f"{name}_variance_32"] = half.variance
-        arrays[f"{name}_oidn_32"] = half.biased["oidn"].full
-        for feature, channels in CHANNELS.items():
-            image = getattr(half, feature)
-            arrays[f"{name}_{feature}"] = image[..., 0] if channels == 1 else image
-    np.savez(tmp_path / "glass.npz", **arrays)
-    return tmp_path
 
 
 def test_archives_are_frames(folder, glass_frame):

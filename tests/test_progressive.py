@@ -139,7 +139,10 @@ def test_activation():
     expected = np.clip((one - two) / np.maximum(three, 1e-6), 0, 1)
     np.testing.assert_allclose(found, expected)
     direct = progressive.direct_activation(outputs)
-    np.testing.assert_allclose(direct, 1 / (1 + np.exp(-one)))
+    share = 1 / (1 + np.exp(-one))
+    np.testing.assert_allclose(direct, np.clip(1.04 * share - 0.02, 0, 1))
+    ends = jnp.array([-9.0, 9.0]).reshape(1, 2, 1, 1) + jnp.zeros((1, 2, 3, 1))
+    np.testing.assert_array_equal(progressive.direct_activation(ends).ravel(), [0, 1])
 
 
 def test_a_network_may_mix():

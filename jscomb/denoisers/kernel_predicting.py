@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.numerics.exposure import in_units
-from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
 from jscomb.numerics.kernels import Kernels, predicted_mean
 from jscomb.typing import Image, Scalar, Variance
 
@@ -24,6 +24,8 @@ def denoise(
     exposure: Scalar | None = None,
 ) -> Image:
     """Average each pixel's window with weights that a network predicts.
+
+    A pixel's weight is divided by 1 + v, at an exposure of one.
 
     Pure, scale-equivariant, and differentiable in every array and in the network's
     parameters, forwards too (for SURE).
@@ -45,11 +47,17 @@ def denoise(
         ValueError: while tracing, if shapes differ, or the network has another window.
 
     Source: S. Bako et al., "Kernel-predicting convolutional networks for denoising
-    Monte Carlo renderings", 2017.
+    Monte Carlo renderings", 2017; the division is ours.
     """
     check_same_shape(noisy=noisy, variance=variance)
     valid = finite(noisy, variance, features)
     unit, x, v = in_units(exposure, valid, noisy, variance=variance)
     kernels = network(x, v, jnp.where(valid, features, 0.0))
-    (mean,) = predicted_mean(x[None], kernels, window, mask=valid)
-    return jnp.where(valid, unit * mean, first_finite(noisy))
+    # Else a firefly spoils every window that it is in, and all that is learned is to
+    # leave each pixel alone.
+    trust = 1 / (1 + jnp.mean(v, axis=-1, keepdims=True))
+    both = jnp.concatenate([trust * x, trust], axis=-1)
+    (mean,) = predicted_mean(both[None], kernels, window, mask=valid)
+    total, weight = mean[..., :-1], jnp.broadcast_to(mean[..., -1:], x.shape)
+    image = unit * divide(total, weight, where=weight > 0)
+    return jnp.where(valid, image, first_finite(noisy))

@@ -1,0 +1,156 @@
+"""Which combiner, at what cost?
+
+    python -m experiments.pareto RESULTS.jsonl --plot FILE.svg
+
+Of what `experiments.sweep` measured. Cost: combining, and the denoised images that it
+takes, in units of the time of one denoising by Open Image Denoise in the same run.
+Error: relative L2 divided by that of the better of path tracing and the denoised image;
+geometric mean over scenes, seeds averaged before. On the front is what nothing cheaper
+is as good as.
+"""
+
+import dataclasses
+import pathlib
+import sys
+from typing import NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+
+from experiments.sweep import Record, read
+
+INPUTS = ("path tracing", "oidn")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to read and write.
+
+    Attributes:
+        results: lines of `experiments.sweep`.
+        metric: a metric of theirs that every seed has.
+        plot: picture to write.
+    """
+
+    results: tyro.conf.Positional[pathlib.Path]
+    metric: str = "relative L2"
+    plot: pathlib.Path | None = None
+
+
+class Row(NamedTuple):
+    """A combiner.
+
+    Attributes:
+        errors: ratio to the better input by sample count, geometric mean over scenes.
+        mean: of all cases, geometric.
+        worst: of all cases.
+        cost: in denoisings, median over cases.
+        front: whether nothing cheaper is as good.
+    """
+
+    errors: dict[int, float]
+    mean: float
+    worst: float
+    cost: float
+    front: bool = False
+
+
+def table(records: list[Record], metric: str) -> dict[str, Row]:
+    """A row for every combiner that was measured in every case.
+
+    Args:
+        records: by `sweep`, of any cases.
+        metric: a metric of theirs.
+
+    Returns:
+        rows by combiner.
+
+    Raises:
+        ValueError: if an input was not measured in some case.
+    """
+    cases: dict[tuple[str, int], dict[str, Record]] = {}
+    for record in records:
+        if record["scale"] == 1:
+            case = cases.setdefault((record["scene"], record["spp"]), {})
+            case[record["combiner"]] = record
+    for case, found in cases.items():
+        if missing := set(INPUTS) - found.keys():
+            raise ValueError(f"{case} has no results of {', '.join(sorted(missing))}")
+    names = [
+        n for n in next(iter(cases.values())) if all(n in c for c in cases.values())
+    ]
+    rows = {}
+    for name in names:
+        ratios, costs = {}, []
+        for case, found in cases.items():
+            of = lambda n, found=found: float(np.mean(found[n]["errors"][metric]))
+            ratios[case] = of(name) / min(of(i) for i in INPUTS)
+            seconds = found[name]["seconds"]
+            unit = found["oidn"]["seconds"]["denoising"]
+            costs.append((seconds["denoising"] + seconds["combining"]) / unit)
+        logs = {case: np.log(max(ratio, 1e-12)) for case, ratio in ratios.items()}
+        counts = sorted({spp for _, spp in cases})
+        by_spp = {
+            spp: float(np.exp(np.mean([v for (_, s), v in logs.items() if s == spp])))
+            for spp in counts
+        }
+        mean = float(np.exp(np.mean(list(logs.values()))))
+        rows[name] = Row(by_spp, mean, max(ratios.values()), float(np.median(costs)))
+    return _with_front(rows)
+
+
+def _with_front(rows: dict[str, Row]) -> dict[str, Row]:
+    """Mark what nothing cheaper is as good as."""
+    place = lambda row: (row.cost, row.mean)
+    better = lambda a, b: a.cost <= b.cost and a.mean <= b.mean and place(a) != place(b)
+    return {
+        name: row._replace(front=not any(better(r, row) for r in rows.values()))
+        for name, row in rows.items()
+    }
+
+
+def draw(rows: dict[str, Row], path: pathlib.Path, metric: str) -> None:
+    """Cost against error, the front marked.
+
+    Args:
+        rows: by `table`.
+        path: picture to write.
+        metric: what the error is.
+    """
+    figure, axes = plt.subplots(figsize=(8, 5.5), layout="constrained")
+    shown = {name: row for name, row in rows.items() if name != "path tracing"}
+    front = sorted((r for r in shown.values() if r.front), key=lambda row: row.cost)
+    axes.plot([r.cost for r in front], [r.mean for r in front], "C1--", zorder=1)
+    for name, row in shown.items():
+        axes.plot(row.cost, row.mean, "o", color="C1" if row.front else "C0")
+        axes.annotate(
+            name, (row.cost, row.mean), (4, 4), textcoords="offset points", fontsize=7
+        )
+    axes.axhline(1, color="0.7", zorder=0)
+    axes.set(xscale="log", yscale="log", xlabel="cost in denoisings")
+    axes.set(ylabel=f"{metric} / that of the better input")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Print the table, and draw it."""
+    config = tyro.cli(Config, description=__doc__)
+    try:
+        rows = table(list(read(config.results).values()), config.metric)
+    except ValueError as error:
+        sys.exit(f"pareto: {error}")
+    counts = list(next(iter(rows.values())).errors)
+    print(f"| | {' | '.join(map(str, counts))} | mean | worst | cost | |")
+    for name, row in rows.items():
+        each = " | ".join(f"{row.errors[spp]:.3f}" for spp in counts)
+        mark = "front" if row.front else ""
+        print(f"| {name} | {each} | {row.mean:.3f} | {row.worst:.2f} ", end="")
+        print(f"| {row.cost:.2f} | {mark} |")
+    if config.plot is not None:
+        draw(rows, config.plot, config.metric)
+
+
+if __name__ == "__main__":
+    main()

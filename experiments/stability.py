@@ -1,0 +1,239 @@
+"""What do the combiners make of the ugliest frames?
+
+    python -m experiments.stability
+
+Synthetic frames of known truth, each hard in its own way. For every combiner: mean
+squared error over the pixels that are finite in the inputs, divided by that of the
+better input; the worst pixel's error, divided by the worst of either input; and whether
+the image and the derivatives in all arrays are finite everywhere.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import tyro
+
+from jscomb import choice, ensemble, progressive
+from jscomb.denoisers import smoothing
+from jscomb.learning import methods
+from jscomb.numerics.guards import finite
+from jscomb.typing import Image, Variance
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to try.
+
+    Attributes:
+        size: width and height in pixels.
+        seed: of the noise.
+        quick: small images, estimators without a network only.
+    """
+
+    size: int = 64
+    seed: int = 0
+    quick: bool = False
+
+
+class Case(NamedTuple):
+    """A hard frame.
+
+    Attributes:
+        unbiased: x, radiance, [H,W,3].
+        biased: y, likewise.
+        variance: of the mean x, squared radiance, likewise.
+        truth: radiance, likewise.
+    """
+
+    unbiased: Image
+    biased: Image
+    variance: Variance
+    truth: Image
+
+
+def cases(size: int, seed: int) -> dict[str, Case]:
+    """All hard frames.
+
+    Args:
+        size: width and height in pixels.
+        seed: of the noise.
+
+    Returns:
+        frames by what is hard about them.
+    """
+    ramp = jnp.linspace(0.1, 2.0, size)
+    truth = jnp.broadcast_to(jnp.outer(ramp, ramp)[..., None], (size, size, 3))
+    deviation = 0.3 * truth + 0.05
+    noise = jax.random.normal(jax.random.key(seed), truth.shape)
+    x, v = truth + deviation * noise, jnp.square(deviation)
+    plain = Case(x, 1.05 * truth, v, truth)
+    at = (slice(None, None, 17), slice(None, None, 13))
+    scaled = lambda s: Case(s * x, s * plain.biased, s * s * v, s * truth)
+    one = lambda h, w: Case(*(image[:h, :w] for image in plain))
+    burnt = plain._replace(unbiased=x.at[at].set(1e6), variance=v.at[at].set(1e12))
+    return {
+        "plain": plain,
+        "fireflies of 1e6": burnt,
+        "fireflies, variance silent": burnt._replace(variance=v),
+        "radiance of 1e-8": scaled(1e-8),
+        "radiance of 1e6": scaled(1e6),
+        "no variance": plain._replace(unbiased=truth, variance=jnp.zeros_like(v)),
+        "x equals y": plain._replace(biased=x),
+        "severely biased": plain._replace(biased=jnp.full_like(x, 50.0)),
+        "NaN and infinite pixels": plain._replace(
+            unbiased=x.at[at].set(jnp.nan), biased=plain.biased.at[1::9, 3].set(jnp.inf)
+        ),
+        "black": Case(*(jnp.zeros_like(x) for _ in Case._fields)),
+        "1x1": one(1, 1),
+        "1xN": one(1, size),
+        "smaller than the window": one(4, 3),
+    }
+
+
+Combine = Callable[[Image, Image, Variance], Image]
+
+
+def _network(name: str, inputs: Callable[..., dict[str, Image]]) -> Combine:
+    """A trained network's combiner, of three images."""
+    network = methods.shipped(name)
+
+    def combine(x: Image, y: Image, v: Variance) -> Image:
+        return methods.METHODS[name].combine(network, inputs(x, y, v))
+
+    return combine
+
+
+def combiners(*, networks: bool = True) -> dict[str, Combine]:
+    """What is tried, as functions of x, y and the variance.
+
+    Args:
+        networks: the trained ones too.
+
+    Returns:
+        functions by name.
+    """
+
+    def sure(x: Image, y: Image, v: Variance) -> Image:
+        """Of a denoiser that does not follow the noise."""
+        some = finite(x, y, v)  # so that derivatives are, too
+        x, y, v = (jnp.where(some, image, 0.0) for image in (x, y, v))
+        return jnp.square(x - y) - v
+
+    def of_bases(x: Image, y: Image, v: Variance) -> Image:
+        bases = jnp.stack([y, smoothing.box(y, window=3)])
+        return ensemble.combine(bases, bases, bases, x, x, solver="hull", filter=False)
+
+    found: dict[str, Combine] = {
+        **choice.UNTRAINED,
+        "progressive": lambda x, y, v: progressive.combine(x, y, v, sure(x, y, v)),
+        "ensemble": of_bases,
+    }
+    if networks:
+        grey = lambda image: jnp.mean(image, axis=-1, keepdims=True)
+        images = lambda x, y, v: {"unbiased": x, "biased": y, "variance": v}
+        found["njs"] = _network(
+            "njs",
+            lambda x, y, v: {
+                "unbiased": x,
+                "biased_a": y,
+                "biased_b": y,
+                "variance": v,
+            },
+        )
+        found["pd"] = _network(
+            "pd", lambda x, y, v: images(x, y, v) | {"sure": sure(x, y, v)}
+        )
+        found["dsc"] = _network(
+            "dsc",
+            lambda x, y, v: (
+                images(x, y, grey(v))
+                | {"prior": smoothing.box(y, window=3), "mse": grey(v) / 4}
+            ),
+        )
+    return found
+
+
+class Outcome(NamedTuple):
+    """Of a combiner on a frame.
+
+    Attributes:
+        error: mean squared error / that of the better input.
+        worst: worst pixel's error / the worst of either input.
+        finite: the image, and all derivatives.
+    """
+
+    error: float
+    worst: float
+    finite: tuple[bool, bool]
+
+
+def outcome(combine: Combine, case: Case) -> Outcome:
+    """Combine, and differentiate.
+
+    Args:
+        combine: of x, y and the variance.
+        case: the frame.
+
+    Returns:
+        what came of it.
+    """
+    *images, truth = case
+    seen = finite(*images)
+
+    def total(*images: Image) -> tuple[Image, Image]:
+        made = combine(*images)
+        return jnp.sum(made), made
+
+    gradients, made = jax.jit(jax.grad(total, argnums=(0, 1, 2), has_aux=True))(*images)
+    square = lambda image: jnp.where(seen, jnp.square(image - truth), 0.0)
+    mean = lambda image: float(jnp.mean(square(image)))
+    worst = lambda image: float(jnp.sqrt(jnp.max(square(image))))
+    inputs = images[:2]
+    ratio = lambda a, b: a / b if b > 0 else float(a > 0)
+    return Outcome(
+        ratio(mean(made), min(map(mean, inputs))),
+        ratio(worst(made), max(map(worst, inputs))),
+        (
+            bool(jnp.isfinite(made).all()),
+            all(bool(jnp.isfinite(g).all()) for g in gradients),
+        ),
+    )
+
+
+def run(config: Config) -> dict[tuple[str, str], Outcome]:
+    """Try everything.
+
+    Args:
+        config: what to try.
+
+    Returns:
+        outcomes by case and combiner.
+    """
+    size = 24 if config.quick else config.size
+    tried = combiners(networks=not config.quick)
+    return {
+        (case, name): outcome(combine, frame)
+        for case, frame in cases(size, config.seed).items()
+        for name, combine in tried.items()
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    found = run(tyro.cli(Config, description=__doc__))
+    names = list(dict.fromkeys(name for _, name in found))
+    print(f"| | {' | '.join(names)} |")
+    for case in dict.fromkeys(case for case, _ in found):
+        cells = []
+        for name in names:
+            error, worst, (image, gradients) = found[case, name]
+            bad = "" if image and gradients else " **not finite**"
+            cells.append(f"{error:.2g}, {worst:.2g}{bad}")
+        print(f"| {case} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,359 @@
+"""Every combiner on every scene, at every sample count, with every seed: one harness.
+
+    python -m experiments.sweep --work FOLDER --results FILE.jsonl
+
+Scenes are rendered into the work folder, or read from archives (see `frames`), which
+have one seed. Combiners that may be traced run vmapped over seeds and over factors for
+the variance that they are told. A result is one line of JSON, keyed by a hash of all
+that it depends on: the same command goes on where it was interrupted, and what is there
+is not measured again. Other experiments read these lines.
+
+Times are medians on one frame after a warm-up: of one sample a pixel, of denoising the
+frame once, and of combining; compilation is the first call less the median.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import pathlib
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import jscomb
+from experiments import frames, render
+from experiments.combiners import COMBINERS
+from jscomb import exr, metrics
+from jscomb.denoisers import oidn
+from jscomb.frame import Frame
+from jscomb.typing import Image
+
+Record = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to sweep over.
+
+    Attributes:
+        work: folder for rendered frames.
+        results: file of JSON lines.
+        scenes: names of own scenes, XML files, or archives, which have sample counts of
+            their own and one seed.
+        spp: samples a pixel.
+        seeds: how many frames of each, of independent samples.
+        size: width and height of rendered frames in pixels.
+        reference_spp: samples a pixel of their references.
+        combiners: keys of `COMBINERS`; all by default.
+        scales: factors for the variance, where a combiner is traced.
+        repeats: timed calls.
+        quick: one tiny scene, two seeds, three combiners.
+    """
+
+    work: pathlib.Path
+    results: pathlib.Path
+    scenes: tuple[str, ...] = ("cornell-box", "cornell-glass", "cornell-glossy")
+    spp: tuple[int, ...] = (4, 16, 64, 256)
+    seeds: int = 4
+    size: int = 128
+    reference_spp: int = 4096
+    combiners: tuple[str, ...] = tuple(COMBINERS)
+    scales: tuple[float, ...] = (1.0,)
+    repeats: int = 3
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        """Reject what is not there."""
+        if unknown := set(self.combiners) - set(COMBINERS):
+            raise ValueError(f"no combiner {sorted(unknown)}; there are {[*COMBINERS]}")
+
+
+QUICK = {
+    "scenes": ("cornell-box",),
+    "spp": (4, 16),
+    "seeds": 2,
+    "size": 32,
+    "reference_spp": 64,
+    "combiners": ("path tracing", "oidn", "whitened 7x7"),
+    "scales": (1.0, 4.0),
+    "repeats": 1,
+}
+
+
+class Case(NamedTuple):
+    """One scene at one sample count.
+
+    Attributes:
+        scene: its name.
+        spp: samples a pixel.
+        frames: one a seed, at an exposure of one, with reference.
+        sample: seconds of one sample a pixel; None where nothing was rendered.
+    """
+
+    scene: str
+    spp: int
+    frames: list[Frame]
+    sample: float | None
+
+
+def cases(config: Config) -> Iterator[Case]:
+    """Render what is missing.
+
+    Args:
+        config: what to sweep over.
+
+    Yields:
+        every scene at every sample count.
+    """
+    for scene in config.scenes:
+        if scene.endswith(".npz"):
+            path = pathlib.Path(scene)
+            for spp in frames.sample_counts(path):
+                frame = frames.load(path, spp)
+                yield Case(path.stem, spp, [frame.scaled(1 / frame.exposure)], None)
+            continue
+        files = _rendered(config, scene)
+        seconds = _sampling(config, scene)
+        for spp, seeds in files.items():
+            yield Case(scene, spp, _of_files(seeds), seconds)
+
+
+def _of_files(paths: list[pathlib.Path]) -> list[Frame]:
+    """All seeds, at the exposure of their reference, so that they are alike."""
+    read = [exr.read_frame(path) for path in paths]
+    assert read[0].reference is not None
+    unit = jnp.median(read[0].reference.image)
+    return [frame.scaled(1 / unit) for frame in read]
+
+
+def _rendered(config: Config, scene: str) -> dict[int, list[pathlib.Path]]:
+    """Files of every sample count and seed; those that are missing are rendered."""
+    config.work.mkdir(parents=True, exist_ok=True)
+    stem = f"{pathlib.Path(scene).stem}-{config.size}"
+    reference = config.work / f"{stem}-reference-{config.reference_spp}.exr"
+    of = functools.partial(render.Config, scene, size=config.size)
+    if not reference.exists():
+        much = {"spp": 4, "reference_spp": config.reference_spp, "denoise": False}
+        render.run(of(out=reference, **much))
+    files, stream = {}, 1_000_000  # away from the reference's streams
+    for spp in config.spp:
+        files[spp] = []
+        for seed in range(config.seeds):
+            out = config.work / f"{stem}-{spp}-{seed}.exr"
+            if not out.exists():
+                render.run(of(out=out, spp=spp, seed=stream, reference_from=reference))
+            stream += 10 * spp + 1000
+            files[spp].append(out)
+    return files
+
+
+def _sampling(config: Config, scene: str) -> float:
+    """Median seconds of one sample a pixel, after the first."""
+    setting = render.Config(scene, config.work / "unused.exr", size=config.size)
+    launch = render.launcher(setting)
+    times = []
+    for number in range(1 + max(config.repeats, 3)):
+        start = time.perf_counter()
+        launch(render.Pass("color0", 1, number, "path"))
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:])
+
+
+def _timed(function: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
+    """The result, the median seconds, and how much longer the first call took."""
+    times, result = [], None
+    for _ in range(1 + repeats):
+        start = time.perf_counter()
+        result = jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    median = statistics.median(times[1:])
+    return result, median, times[0] - median
+
+
+def errors(image: Image, frame: Frame, *, displayed: bool) -> dict[str, float]:
+    """Every metric.
+
+    Args:
+        image: linear radiance.
+        frame: with a reference.
+        displayed: FLIP and HDR-FLIP too, which take a second.
+
+    Returns:
+        errors by name; NaN where an evaluator rejects the image.
+    """
+    assert frame.reference is not None
+    r, noise = frame.reference
+    measures: dict[str, Callable[[], Any]] = {
+        "relative L2": lambda: metrics.rel_l2(image, r, half_difference=noise),
+        "RMSE": lambda: metrics.rmse(image, r),
+        "SMAPE": lambda: metrics.smape(image, r),
+        "DSSIM": lambda: metrics.dssim(image, r),
+    }
+    if displayed:
+        measures["FLIP"] = lambda: metrics.flip(image, r)
+        measures["HDR-FLIP"] = lambda: metrics.hdr_flip(image, r)
+    return {name: float(measure()) for name, measure in measures.items()}
+
+
+def measure(case: Case, name: str, config: Config) -> Iterator[Record]:
+    """Measure a combiner on all seeds of a case.
+
+    Args:
+        case: the frames.
+        name: key of `COMBINERS`.
+        config: scales and repeats.
+
+    Yields:
+        one record for each factor of the variance.
+    """
+    chosen, seeds = COMBINERS[name], case.frames
+    scales = config.scales if chosen.traced else (1.0,)
+    # One frame's time is what a user waits for, not its share of a batch.
+    if chosen.traced:
+        one = jax.jit(chosen.combine)
+        once = lambda: one(seeds[0], jnp.float32(1))
+        over_seeds = jax.vmap(chosen.combine, (0, None))
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
+        both = jax.jit(jax.vmap(over_seeds, (None, 0)))
+        images = both(stacked, jnp.asarray(scales, jnp.float32))
+    else:
+        once = lambda: chosen.combine(seeds[0])
+        images = jnp.stack([chosen.combine(frame) for frame in seeds])[None]
+    _, seconds, compiling = _timed(once, config.repeats)
+    for scale, each in zip(scales, images, strict=True):
+        found = [
+            errors(image, frame, displayed=number == 0 and scale == 1.0)
+            for number, (image, frame) in enumerate(zip(each, seeds, strict=True))
+        ]
+        yield {
+            "scene": case.scene,
+            "spp": case.spp,
+            "combiner": name,
+            "scale": scale,
+            "errors": {
+                metric: [row[metric] for row in found if metric in row]
+                for metric in found[0]
+            },
+            "seconds": {
+                "sampling": None if case.sample is None else case.sample * case.spp,
+                "denoising": chosen.denoised * _denoising(seeds[0], config.repeats),
+                "combining": seconds,
+                "compiling": compiling,
+            },
+        }
+
+
+def _denoising(frame: Frame, repeats: int) -> float:
+    """Median seconds of Open Image Denoise on a frame."""
+    guides = {"albedo": frame.albedo, "normal": frame.normal}
+    denoise = functools.partial(oidn.denoise, frame.color, **guides)
+    return _timed(denoise, repeats)[1]
+
+
+def digest_of(case: Case) -> str:
+    """Hash of a case's pixels.
+
+    Args:
+        case: the frames.
+
+    Returns:
+        hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(case.frames):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def key_of(pixels: str, *rest: str | float) -> str:
+    """Hash of all that a result depends on.
+
+    Args:
+        pixels: by `digest_of`.
+        rest: names and numbers.
+
+    Returns:
+        hexadecimal digits.
+    """
+    said = json.dumps([pixels, jscomb.__version__, *rest])
+    return hashlib.sha256(said.encode()).hexdigest()[:16]
+
+
+def read(path: pathlib.Path) -> dict[str, Record]:
+    """Results by key.
+
+    Args:
+        path: file of JSON lines; need not exist. A line that an interruption cut short
+            is left out.
+
+    Returns:
+        the records.
+    """
+    found = {}
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            continue  # empty, or cut short
+        found[record["key"]] = record
+    return found
+
+
+def run(
+    config: Config, *, change: Callable[[Case], Case] = lambda case: case
+) -> list[Record]:
+    """Measure what is missing.
+
+    Args:
+        config: what to sweep over.
+        change: to make of every case before it is measured.
+
+    Returns:
+        the records of this configuration.
+    """
+    if config.quick:
+        config = dataclasses.replace(config, **QUICK)
+    config.results.parent.mkdir(parents=True, exist_ok=True)
+    done, records = read(config.results), []
+    bar = tqdm(unit="combiner")
+    for case in map(change, cases(config)):
+        pixels = digest_of(case)
+        for name in config.combiners:
+            bar.set_description(f"{case.scene} {case.spp} {name}")
+            scales = config.scales if COMBINERS[name].traced else (1.0,)
+            keys = [key_of(pixels, name, scale, config.repeats) for scale in scales]
+            if any(key not in done for key in keys):
+                new = zip(keys, measure(case, name, config), strict=True)
+                _append(config.results, [{"key": key, **record} for key, record in new])
+                done = read(config.results)
+            records += [done[key] for key in keys]
+            bar.update()
+    bar.close()
+    return records
+
+
+def _append(path: pathlib.Path, records: list[Record]) -> None:
+    """New lines; each begins with its line break, so that it ends one cut short."""
+    with path.open("a") as file:
+        file.writelines("\n" + json.dumps(record) for record in records)
+
+
+def main() -> None:
+    """Run from the command line."""
+    try:
+        run(tyro.cli(Config, description=__doc__))
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"sweep: {' '.join(str(error).split())}")
+
+
+if __name__ == "__main__":
+    main()
