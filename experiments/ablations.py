@@ -26,7 +26,8 @@ def _equal(network, inputs, **options):
     return james_stein.neural_combine(network, **inputs, **options)
 
 
-_PD = METHODS["pd"]._replace(combine=_quotient)
+# The bound needs an x without bias, which half of those that training draws are not.
+_PD = METHODS["pd"]._replace(combine=_quotient, training={"bound": False})
 
 ABLATIONS: dict[str, methods.Method] = {
     "njs-equal": METHODS["njs"]._replace(combine=_equal),

@@ -143,14 +143,10 @@ def objective(
         of network, inputs, reference and exposure; in units of that exposure.
     """
     chosen = ALL[method]
-    # The bound is of the method as it is used: it needs an x without bias, which in
-    # training half of them are not.
-    options = {"bound": False} if method.startswith("pd") else {}
-
     measure = loss or chosen.loss
 
     def of_frame(network, inputs, reference, exposure):
-        image = chosen.combine(network, inputs, exposure=exposure, **options)
+        image = chosen.combine(network, inputs, exposure=exposure, **chosen.training)
         return measure(image / exposure, reference / exposure)
 
     return of_frame

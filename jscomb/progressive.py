@@ -236,19 +236,22 @@ def activation(outputs: Float[Array, "h w 3 c"]) -> Image:
     return jnp.clip((first - second) / jnp.maximum(third, 1e-6), 0.0, 1.0)
 
 
-def direct_activation(outputs: Float[Array, "h w 3 c"]) -> Image:
+def direct_activation(
+    outputs: Float[Array, "h w 3 c"], *, beyond: float = 0.02
+) -> Image:
     """Alpha from the first output alone, without the form of eq. 9.
 
     Args:
         outputs: xi_1 and two that do not count, shape [H,W,3,C].
+        beyond: e, by which the logistic function is stretched before it is cut, so that
+            0 and 1 are reached: a thousandth of a firefly is still one. 0 to train by,
+            since what is cut has no derivative.
 
     Returns:
-        clip((1 + 2 e) sigmoid(xi_1) - e, 0, 1) with e = 0.02, shape [H,W,C]; 0 and 1
-        are reached, since a thousandth of a firefly is still one.
+        clip((1 + 2 e) sigmoid(xi_1) - e, 0, 1), shape [H,W,C].
 
     Source: PD table 4, which finds it worse; trained on our frames it is better.
     """
-    beyond = 0.02
     share = jax.nn.sigmoid(outputs[:, :, 0])
     return jnp.clip((1 + 2 * beyond) * share - beyond, 0.0, 1.0)
 

@@ -8,6 +8,7 @@ import functools
 import importlib.resources
 import json
 import pathlib
+import types
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -38,12 +39,14 @@ class Method(NamedTuple):
             training may draw as well.
         combine: of a network, the inputs and an exposure.
         loss: of an image and a reference.
+        training: options of `combine` to train by.
     """
 
     network: Callable[..., Network]
     variants: Callable[[Key, Frame, str], list[Inputs]]
     combine: Callable[..., Image]
     loss: Callable[[Image, Image], Scalar]
+    training: Mapping[str, Any] = types.MappingProxyType({})
 
 
 def _james_stein(key: Key, frame: Frame, name: str) -> list[Inputs]:
@@ -173,6 +176,7 @@ METHODS = {
             )
         ),
         losses.log_l2,
+        {"activate": functools.partial(progressive.direct_activation, beyond=0.0)},
     ),
 }
 """The combiners whose trained parameters come with the package. Away from the papers,
