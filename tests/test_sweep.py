@@ -13,6 +13,7 @@ from experiments import (
     convergence,
     equal_time,
     pareto,
+    pixels,
     stability,
     sweep,
 )
@@ -191,3 +192,19 @@ def test_regret_is_relative_to_the_least(folder):
     least = min(row[name] for name in CANDIDATES[:2])
     np.testing.assert_allclose(table["chosen"], [row[chosen] / least])
     assert json.dumps(rows)
+
+
+def test_changes_of_pixels_add_up(glass_frame):
+    """What was removed less what was added is the change of the mean error."""
+    frame = glass_frame.scaled(1 / glass_frame.exposure)
+    r, y = frame.reference.image, frame.biased["oidn"].full
+    same = pixels.changed(y, frame)
+    assert same[1:] == (0, 0, 0, 0)
+    perfect = pixels.changed(r, frame)
+    assert perfect.worse == perfect.added == 0
+    assert perfect.removed == pytest.approx(1)
+    x = pixels.changed(frame.color, frame)
+    ratio = float(metrics.rel_l2(frame.color, r) / metrics.rel_l2(y, r))
+    assert 1 - x.removed + x.added == pytest.approx(ratio, rel=1e-4)
+    with pytest.raises(ValueError, match="no reference"):
+        pixels.changed(y, frame._replace(reference=None))

@@ -1,0 +1,157 @@
+"""Which pixels does a combiner make worse?
+
+    python -m experiments.pixels FRAME.exr ... --plot FILE.png
+
+On frames with a reference, against the denoised image: how many pixels' squared errors,
+relative to radiance, fell and rose by more than a thousandth, and by how much of the
+denoised image's error all of them together; and maps of the change (NJS figure 19).
+"""
+
+import dataclasses
+import pathlib
+import sys
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+from matplotlib.colors import SymLogNorm
+
+from experiments.combiners import COMBINERS
+from jscomb import exr
+from jscomb.frame import Frame
+from jscomb.typing import Image
+
+THRESHOLD = 1e-3  # relative squared error
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to compare.
+
+    Attributes:
+        frames: EXR files with a reference and the denoised image `oidn`.
+        combiners: keys of `COMBINERS`.
+        plot: picture of the maps to write.
+    """
+
+    frames: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    combiners: tuple[str, ...] = ("whitened 7x7", "njs", "pd", "dsc")
+    plot: pathlib.Path | None = None
+
+
+class Changed(NamedTuple):
+    """What became of the denoised image's pixels.
+
+    Attributes:
+        change: of the relative squared error, [H,W].
+        better: share of pixels whose error fell by more than `THRESHOLD`.
+        worse: share whose error rose by more.
+        removed: what those that fell lost, of the whole error.
+        added: what those that rose gained.
+    """
+
+    change: np.ndarray
+    better: float
+    worse: float
+    removed: float
+    added: float
+
+
+def changed(image: Image, frame: Frame) -> Changed:
+    """Compare an image with the denoised one.
+
+    Args:
+        image: radiance at an exposure of one, [H,W,3].
+        frame: with reference and `oidn`, likewise.
+
+    Returns:
+        the change of every pixel's error, and its parts.
+
+    Raises:
+        ValueError: if the frame lacks either.
+    """
+    if frame.reference is None or "oidn" not in frame.biased:
+        raise ValueError("a frame has no reference or no biased image 'oidn'")
+    r = frame.reference.image
+    weight = jnp.square(jnp.mean(r, axis=-1)) + 0.01
+    error = lambda i: np.asarray(jnp.mean(jnp.square(i - r), axis=-1) / weight)
+    before = error(frame.biased["oidn"].full)
+    change = error(image) - before
+    fell, rose = change < 0, change > 0
+    return Changed(
+        change,
+        float(np.mean(change < -THRESHOLD)),
+        float(np.mean(change > THRESHOLD)),
+        float(-change[fell].sum() / before.sum()),
+        float(change[rose].sum() / before.sum()),
+    )
+
+
+def run(config: Config) -> dict[tuple[str, str], Changed]:
+    """Compare all.
+
+    Args:
+        config: frames and combiners.
+
+    Returns:
+        by frame and combiner.
+    """
+    found = {}
+    for path in config.frames:
+        frame = exr.read_frame(path)
+        frame = frame.scaled(1 / frame.exposure)
+        for name in config.combiners:
+            chosen = COMBINERS[name]
+            given = [frame, jnp.float32(1)] if chosen.traced else [frame]
+            found[path.stem, name] = changed(chosen.combine(*given), frame)
+    return found
+
+
+def draw(found: dict[tuple[str, str], Changed], path: pathlib.Path) -> None:
+    """Maps: blue where the error fell, red where it rose, logarithmic beyond a limit.
+
+    Args:
+        found: by `run`.
+        path: picture to write.
+    """
+    names = list(dict.fromkeys(frame for frame, _ in found))
+    combiners = list(dict.fromkeys(name for _, name in found))
+    figure, axes = plt.subplots(
+        len(names),
+        len(combiners),
+        figsize=(3 * len(combiners), 3.2 * len(names)),
+        squeeze=False,
+        layout="constrained",
+    )
+    scale = SymLogNorm(THRESHOLD, vmin=-1, vmax=1)
+    for (frame, name), each in found.items():
+        ax = axes[names.index(frame), combiners.index(name)]
+        shown = ax.imshow(each.change, norm=scale, cmap="RdBu_r")
+        ax.set_title(f"{frame}\n{name}", fontsize=8)
+        ax.axis("off")
+    figure.colorbar(
+        shown, ax=axes, shrink=0.6, label="change of relative squared error"
+    )
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Print the table, and draw the maps."""
+    config = tyro.cli(Config, description=__doc__)
+    try:
+        found = run(config)
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"pixels: {' '.join(str(error).split())}")
+    print("| frame | combiner | better | worse | error removed | error added |")
+    for (frame, name), each in found.items():
+        numbers = " | ".join(f"{100 * value:.1f} %" for value in each[1:])
+        print(f"| {frame} | {name} | {numbers} |")
+    if config.plot is not None:
+        draw(found, config.plot)
+
+
+if __name__ == "__main__":
+    main()
