@@ -9,11 +9,9 @@ from jscomb.learning.methods import METHODS
 
 def _no_sure(key, frame, name):
     """PD's inputs with what is known of the error without a derivative."""
-    taken, _ = METHODS["pd"].variants(key, frame, name)
+    taken = METHODS["pd"].inputs(key, frame, name)
     x, y, v = (taken[n] for n in ("unbiased", "biased", "variance"))
-    s = jnp.square(x - y) - v
-    exchanged = {"unbiased": y, "biased": x, "variance": s, "sure": v}
-    return [taken | {"sure": s}, exchanged]
+    return taken | {"sure": jnp.square(x - y) - v}
 
 
 def _quotient(network, inputs, **options):
@@ -34,7 +32,7 @@ ABLATIONS: dict[str, methods.Method] = {
     "dsc-log": METHODS["dsc"]._replace(loss=losses.log_l2),
     "pd-quotient": _PD,
     "pd-smape": _PD._replace(loss=metrics.smape),
-    "pd-no-sure": _PD._replace(variants=_no_sure),
+    "pd-no-sure": _PD._replace(inputs=_no_sure, other=methods.exchanged(_no_sure)),
 }
 """njs-equal and pd-smape are as in the papers; pd-quotient and pd-no-sure are of PD's
 table 4, whose third, without the bound, trains nothing."""

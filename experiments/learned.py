@@ -71,7 +71,7 @@ def measure_untrained(frame: Frame) -> dict[str, float]:
     images["james-stein, y*"] = james_stein.combine(x, star, pooled)
     shrunk = double_shrinkage.combine_frame(frame, "oidn", stride=2)
     images |= {"double shrinkage": shrunk.image, "its prior": shrunk.prior}
-    (pd, _) = methods.METHODS["pd"].variants(jax.random.key(0), frame, "oidn")
+    pd = methods.METHODS["pd"].inputs(jax.random.key(0), frame, "oidn")
     mix = functools.partial(progressive.mixing, whiten=True)
     images["progressive, whitened"] = progressive.combine(**pd, mix=mix)
     return _errors(images, frame)
@@ -79,10 +79,11 @@ def measure_untrained(frame: Frame) -> dict[str, float]:
 
 def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
     """Regressed and plain, in this order."""
-    key = jax.random.key(0)
-    variants = methods.METHODS["njs"].variants(key, frame, "oidn")
+    njs, key = methods.METHODS["njs"], jax.random.key(0)
+    assert njs.other is not None
+    both = [make(key, frame, "oidn") for make in (njs.inputs, njs.other)]
     plain = lambda inputs: bool(jnp.all(inputs["biased_a"] == inputs["biased_b"]))
-    return sorted(variants, key=plain)
+    return sorted(both, key=plain)
 
 
 def measure_network(
@@ -92,7 +93,7 @@ def measure_network(
     chosen = train.ALL[method]
     one = jnp.ones((), frame.color.dtype)
     combine = lambda inputs, **o: chosen.combine(network, inputs, exposure=one, **o)
-    taken, *_ = chosen.variants(jax.random.key(0), frame, "oidn")
+    taken = chosen.inputs(jax.random.key(0), frame, "oidn")
     images = {"": jax.jit(combine)(taken)}
     if method.startswith("njs"):
         regressed, plain = map(jax.jit(combine), _james_stein_inputs(frame))

@@ -118,7 +118,8 @@ def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
             raise ValueError(f"{file} has no reference")
         if not float(jnp.median(frame.reference.image)) > 0:
             continue  # a camera where no light comes
-        variants = ALL[method].variants(jax.random.key(number), frame, "oidn")
+        makers = filter(None, (ALL[method].inputs, ALL[method].other))
+        variants = [make(jax.random.key(number), frame, "oidn") for make in makers]
         inputs.append(
             {name: np.stack([v[name] for v in variants]) for name in variants[0]}
         )

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jscomb import double_shrinkage, james_stein, metrics, progressive
 from jscomb.denoisers import kernel_predicting, oidn
@@ -34,60 +35,68 @@ class Method(NamedTuple):
 
     Attributes:
         network: draws one, of a key and a size.
-        variants: of a key, a frame and the name of its biased image, the inputs at an
-            exposure of one; first those that a frame is combined by, then others that
-            training may draw as well.
+        inputs: of a key, a frame and the name of its biased image, what the frame is
+            combined by, at an exposure of one.
         combine: of a network, the inputs and an exposure.
         loss: of an image and a reference.
+        other: likewise, what training may draw as well; None if there is no such thing.
         training: options of `combine` to train by.
     """
 
     network: Callable[..., Network]
-    variants: Callable[[Key, Frame, str], list[Inputs]]
+    inputs: Callable[[Key, Frame, str], Inputs]
     combine: Callable[..., Image]
     loss: Callable[[Image, Image], Scalar]
+    other: Callable[[Key, Frame, str], Inputs] | None = None
     training: Mapping[str, Any] = types.MappingProxyType({})
 
 
-def _james_stein(key: Key, frame: Frame, name: str) -> list[Inputs]:
-    """Regressed where the halves say that it pays, and the other way."""
-    unit, image = frame.exposure, frame.biased[name]
-    pairs = [[image.full, image.full]]
-    if image.halves is not None:
-        regressed = james_stein.regress(key, frame, name, stride=_STRIDE, always=True)
-        assert regressed.biased.halves is not None
-        place = 0 if regressed.change.helps else 1
-        pairs.insert(place, list(regressed.biased.halves))
-    return [
-        {
-            "unbiased": frame.color / unit,
-            "biased_a": a / unit,
-            "biased_b": b / unit,
-            "variance": frame.variance / jnp.square(unit),
-        }
-        for a, b in pairs
-    ]
+def _james_stein(key: Key, frame: Frame, name: str) -> Inputs:
+    """Regressed where the halves say that it pays."""
+    if frame.biased[name].halves is None:
+        return _of_halves(frame, name, None)
+    found = james_stein.regress(key, frame, name, stride=_STRIDE)
+    return _of_halves(frame, name, found.biased.halves if found.ran else None)
 
 
-def _double_shrinkage(key: Key, frame: Frame, name: str) -> list[Inputs]:
+def _other_james_stein(key: Key, frame: Frame, name: str) -> Inputs:
+    """Regressed where the halves say that it does not pay."""
+    found = james_stein.regress(key, frame, name, stride=_STRIDE, always=True)
+    helps = found.change.helps
+    return _of_halves(frame, name, None if helps else found.biased.halves)
+
+
+def _of_halves(
+    frame: Frame, name: str, halves: Float[Array, "2 h w c"] | None
+) -> Inputs:
+    """With regressed halves, or the biased image in place of both."""
+    unit, full = frame.exposure, frame.biased[name].full
+    a, b = (full, full) if halves is None else halves
+    return {
+        "unbiased": frame.color / unit,
+        "biased_a": a / unit,
+        "biased_b": b / unit,
+        "variance": frame.variance / jnp.square(unit),
+    }
+
+
+def _double_shrinkage(key: Key, frame: Frame, name: str) -> Inputs:
     """What the combiner without a network makes of the frame on its way."""
     del key
     made = double_shrinkage.combine_frame(frame, name, stride=_STRIDE)
     unit = frame.exposure
     mean = lambda e: jnp.mean(e, axis=-1, keepdims=True) / jnp.square(unit)
-    return [
-        {
-            "prior": made.prior / unit,
-            "unbiased": frame.color / unit,
-            "biased": frame.biased[name].full / unit,
-            "variance": mean(made.variance),
-            "mse": mean(made.mse),
-        }
-    ]
+    return {
+        "prior": made.prior / unit,
+        "unbiased": frame.color / unit,
+        "biased": frame.biased[name].full / unit,
+        "variance": mean(made.variance),
+        "mse": mean(made.mse),
+    }
 
 
-def _progressive(key: Key, frame: Frame, name: str) -> list[Inputs]:
-    """With SURE of Open Image Denoise; and with the two images' parts exchanged."""
+def _progressive(key: Key, frame: Frame, name: str) -> Inputs:
+    """With SURE of Open Image Denoise."""
     if name != "oidn":
         raise ValueError(
             f"pd needs a denoiser's derivative, not only its image: it knows oidn, "
@@ -102,26 +111,41 @@ def _progressive(key: Key, frame: Frame, name: str) -> list[Inputs]:
     x = frame.color / unit
     v = james_stein.robust_variance(frame.variance) / jnp.square(unit)
     y, s, _ = monte_carlo_sure(key, denoise, x, v)
-    taken = {"unbiased": x, "biased": y, "variance": v, "sure": s}
-    return [taken, {"unbiased": y, "biased": x, "variance": s, "sure": v}]
+    return {"unbiased": x, "biased": y, "variance": v, "sure": s}
 
 
-def _kernel_predicting(key: Key, frame: Frame, name: str) -> list[Inputs]:
+def exchanged(inputs: Callable[[Key, Frame, str], Inputs]) -> Callable[..., Inputs]:
+    """PD's inputs with the parts of its two images exchanged.
+
+    Args:
+        inputs: of a key, a frame and a name.
+
+    Returns:
+        likewise.
+    """
+
+    def other(key: Key, frame: Frame, name: str) -> Inputs:
+        taken = inputs(key, frame, name)
+        x, y, v, s = (taken[n] for n in ("unbiased", "biased", "variance", "sure"))
+        return {"unbiased": y, "biased": x, "variance": s, "sure": v}
+
+    return other
+
+
+def _kernel_predicting(key: Key, frame: Frame, name: str) -> Inputs:
     """Of the noisy image and its features alone."""
     del key, name
     unit = frame.exposure
     if frame.albedo is None or frame.normal is None or frame.depth is None:
         raise ValueError("a kernel predictor needs albedo, normal and depth")
     albedo, normal, depth = jnp.split(stack(frame)[..., :7], [3, 6], axis=-1)
-    return [
-        {
-            "noisy": frame.color / unit,
-            "variance": frame.variance / jnp.square(unit),
-            "albedo": albedo,
-            "normal": normal,
-            "depth": depth,
-        }
-    ]
+    return {
+        "noisy": frame.color / unit,
+        "variance": frame.variance / jnp.square(unit),
+        "albedo": albedo,
+        "normal": normal,
+        "depth": depth,
+    }
 
 
 def _predict(network: Network, inputs: Mapping[str, Image], **options: Any) -> Image:
@@ -158,6 +182,7 @@ METHODS = {
             functools.partial(james_stein.neural_combine, window=7, whiten=True)
         ),
         losses.log_l2,
+        _other_james_stein,
     ),
     "dsc": Method(
         networks.ShrinkageNetwork,
@@ -176,6 +201,7 @@ METHODS = {
             )
         ),
         losses.log_l2,
+        exchanged(_progressive),
         {"activate": functools.partial(progressive.direct_activation, beyond=0.0)},
     ),
 }
@@ -270,7 +296,7 @@ def combine_frame(
         raise ValueError(
             f"the networks want three channels, got {frame.color.shape[-1]}"
         )
-    inputs = _known(method).variants(key, frame, name)[0]
+    inputs = _known(method).inputs(key, frame, name)
     network = shipped(method) if network is None else network
     return frame.exposure * _combine(network, inputs, method=method)
 
