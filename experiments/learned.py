@@ -79,9 +79,10 @@ def measure_untrained(frame: Frame) -> dict[str, float]:
 
 def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
     """Regressed and plain, in this order."""
-    njs, key = methods.METHODS["njs"], jax.random.key(0)
+    njs = methods.METHODS["njs"]
     assert njs.other is not None
-    both = [make(key, frame, "oidn") for make in (njs.inputs, njs.other)]
+    makers = njs.inputs, njs.other
+    both = [make(jax.random.key(0), frame, "oidn") for make in makers]
     plain = lambda inputs: bool(jnp.all(inputs["biased_a"] == inputs["biased_b"]))
     return sorted(both, key=plain)
 
