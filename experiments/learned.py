@@ -25,7 +25,7 @@ from experiments import frames, train
 from jscomb import double_shrinkage, james_stein, progressive
 from jscomb.choice import UNTRAINED
 from jscomb.frame import Frame
-from jscomb.learning import methods
+from jscomb.learning import methods, networks
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
 
@@ -129,7 +129,19 @@ def networks_of(
             path = card.with_name("network.safetensors")
             network = methods.load(train.ALL[about["method"]], path)
             found[card.parent.name] = about["method"], network
-    return found
+    return found | _separate(found)
+
+
+def _separate(
+    found: dict[str, tuple[str, methods.Network]],
+) -> dict[str, tuple[str, methods.Network]]:
+    """A denoiser and a combiner that were not trained jointly, as if they were."""
+    parts = [found.get(f"{name}-light") for name in ("kernels", "njs-equal")]
+    if None in parts:
+        return {}
+    both = networks.Joint(jax.random.key(0), size="light")
+    both.denoiser, both.combiner = (part[1] for part in parts if part)
+    return {"kernels-light and njs-equal-light": ("kernels-njs", both)}
 
 
 def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
