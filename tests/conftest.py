@@ -22,6 +22,18 @@ mpl.use("agg")
 DATA = pathlib.Path(__file__).parent / "data"
 
 
+_STATES: dict[str, dict] = {}
+
+
+@pytest.fixture(autouse=True)
+def same_numbers(request):
+    """What a module's `RNG` draws does not depend on which of its tests ran before."""
+    rng = getattr(request.module, "RNG", None)
+    if rng is not None:
+        generator = rng.bit_generator
+        generator.state = _STATES.setdefault(request.module.__name__, generator.state)
+
+
 @pytest.fixture
 def unchecked():
     """As users run it: without jaxtyping's checks, which would answer first."""
