@@ -125,13 +125,16 @@ def slope(spp: np.ndarray, errors: np.ndarray) -> float:
     return float(np.polyfit(np.log(spp), np.log(np.maximum(errors, 1e-12)), 1)[0])
 
 
-def draw(found: dict, path: pathlib.Path, metric: str) -> None:
+def draw(
+    found: dict, path: pathlib.Path, metric: str, *, along: str = "samples a pixel"
+) -> None:
     """Log-log curves, a panel for each scene.
 
     Args:
-        found: by `curves`.
+        found: abscissae and errors by combiner, by scene.
         path: picture to write.
         metric: what the error is.
+        along: what the abscissae are.
     """
     columns = min(3, len(found))
     lines = -(-len(found) // columns)
@@ -148,7 +151,7 @@ def draw(found: dict, path: pathlib.Path, metric: str) -> None:
         for number, (name, (spp, errors)) in enumerate(of_scene.items()):
             style = ("-", "--", ":")[number // 10 % 3]
             ax.loglog(spp, errors, style, label=name, lw=2 if number < 2 else 1)
-        ax.set(title=scene, xlabel="samples a pixel", ylabel=metric)
+        ax.set(title=scene, xlabel=along, ylabel=metric)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -9,32 +9,14 @@ denoiser, would take for the error that the combiner has at the median of its ti
 the power law between two counts; beyond the last count it is a lower bound, marked >.
 """
 
-import dataclasses
-import pathlib
 import sys
 
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from experiments.pareto import INPUTS
+from experiments.convergence import draw
+from experiments.pareto import INPUTS, Config
 from experiments.sweep import Record, read
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """What to read and write.
-
-    Attributes:
-        results: lines of `experiments.sweep`.
-        metric: a metric of theirs that every seed has.
-        plot: picture to write.
-    """
-
-    results: tyro.conf.Positional[pathlib.Path]
-    metric: str = "relative L2"
-    plot: pathlib.Path | None = None
-
 
 Curve = tuple[np.ndarray, np.ndarray]
 
@@ -113,31 +95,6 @@ def speedups(of_scene: dict[str, Curve]) -> dict[str, dict[str, tuple[float, boo
     return found
 
 
-def draw(found: dict[str, dict[str, Curve]], path: pathlib.Path, metric: str) -> None:
-    """Seconds against error, a panel for each scene.
-
-    Args:
-        found: by `curves`.
-        path: picture to write.
-        metric: what the error is.
-    """
-    figure, axes = plt.subplots(
-        1,
-        len(found),
-        figsize=(5 * len(found), 4.5),
-        squeeze=False,
-        layout="constrained",
-    )
-    for ax, (scene, of_scene) in zip(axes[0], found.items(), strict=True):
-        for number, (name, (seconds, errors)) in enumerate(of_scene.items()):
-            style = "-" if name in INPUTS else ("--", ":", "-.")[number // 10 % 3]
-            ax.loglog(seconds, errors, style, label=name, lw=2 if name in INPUTS else 1)
-        ax.set(title=scene, xlabel="seconds", ylabel=metric)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
 def main() -> None:
     """Print the table, and draw the curves."""
     config = tyro.cli(Config, description=__doc__)
@@ -151,7 +108,7 @@ def main() -> None:
             cells = [f"{'>' if b else ''}{f:.1f}" for f, b in factors.values()]
             print(f"| {name} | {' | '.join(cells)} |")
     if config.plot is not None:
-        draw(found, config.plot, config.metric)
+        draw(found, config.plot, config.metric, along="seconds")
 
 
 if __name__ == "__main__":

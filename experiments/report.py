@@ -155,7 +155,10 @@ def plots(records: list[Record], metric: str) -> list[str]:
     drawn.append(_svg(lambda file: convergence.draw(curves, file, metric)))
     if any(record["seconds"]["sampling"] is not None for record in records):
         timed = equal_time.curves(records, metric)
-        drawn.append(_svg(lambda file: equal_time.draw(timed, file, metric)))
+        along = "seconds"
+        drawn.append(
+            _svg(lambda file: convergence.draw(timed, file, metric, along=along))
+        )
     return drawn
 
 

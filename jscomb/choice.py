@@ -169,7 +169,8 @@ def choose(
         nothing about; it gets `whitened`, and no trials.
 
     Raises:
-        ValueError: if there is no such biased image, or several and no name.
+        ValueError: if there is no such biased image or method, no method at all, or
+            several images and no name.
 
     Example:
         >>> import jax
@@ -188,6 +189,8 @@ def choose(
     name = _only(frame) if name is None else name
     if name not in frame.biased:
         raise ValueError(f"no biased image {name!r}; there are {list(frame.biased)}")
+    if not methods or not set(methods) <= METHODS.keys():
+        raise ValueError(f"methods {list(methods)}: there are {', '.join(METHODS)}")
     if frame.sub_buffers < 2 or frame.biased[name].halves is None:
         return Choice(_UNJUDGED, ())
     halves = [_quartered(half, name) for half in frame.halves()]

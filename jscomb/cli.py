@@ -259,6 +259,7 @@ def _all_methods(frame: Frame) -> tuple[dict[str, Image], dict[str, str]]:
             print(f"{method}: {error}")
             continue
         ms[method] = f"{time_of_one:.1f}"
+    ms[choice.KEEP] = ""  # its time is the denoiser's, where that is installed
     if oidn.available():
         guides = {"albedo": frame.albedo, "normal": frame.normal}
         denoise = functools.partial(oidn.denoise, **guides)

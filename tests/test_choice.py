@@ -94,6 +94,9 @@ def test_bad_input(glass_frame):
     two = glass_frame.with_biased("other", glass_frame.biased["oidn"])
     with pytest.raises(ValueError, match="of which biased image"):
         choose(two)
+    for methods in ([], ["kept", "x"]):
+        with pytest.raises(ValueError, match=r"methods \[.*: there are kept, james"):
+            choose(glass_frame, methods=methods)
     with pytest.raises(ValueError, match="no method 'x'; there are kept"):
         choice.combine(key(), glass_frame, "oidn", method="x")
     with pytest.raises(ValueError, match="no biased image 'x'"):
