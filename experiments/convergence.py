@@ -37,7 +37,7 @@ class Config:
         biased: the sweep's work folder, to measure dominance on its frames; the results
             are added to the lines, as scenes whose names end in " blurred".
         plot: picture to write.
-        quick: with `biased`, the sweep's own quick frames.
+        quick: measure the quick sweep first; with `biased`, on its frames too.
     """
 
     results: tyro.conf.Positional[pathlib.Path]
@@ -163,7 +163,7 @@ def main() -> None:
     try:
         if config.biased is not None:
             measure_blurred(config)
-        found = curves(list(sweep.read(config.results).values()), config.metric)
+        found = curves(sweep.results(config.results, quick=config.quick), config.metric)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
         sys.exit(f"convergence: {' '.join(str(error).split())}")
     for scene, of_scene in found.items():

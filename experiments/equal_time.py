@@ -16,7 +16,7 @@ import tyro
 
 from experiments.convergence import draw
 from experiments.pareto import INPUTS, Config
-from experiments.sweep import Record, read
+from experiments.sweep import Record, results
 
 Curve = tuple[np.ndarray, np.ndarray]
 
@@ -99,9 +99,9 @@ def main() -> None:
     """Print the table, and draw the curves."""
     config = tyro.cli(Config, description=__doc__)
     try:
-        found = curves(list(read(config.results).values()), config.metric)
-    except ValueError as error:
-        sys.exit(f"equal_time: {error}")
+        found = curves(results(config.results, quick=config.quick), config.metric)
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"equal_time: {' '.join(str(error).split())}")
     for scene, of_scene in found.items():
         print(f"\n| {scene} | {' | '.join(INPUTS)} |")
         for name, factors in speedups(of_scene).items():

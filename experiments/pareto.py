@@ -6,7 +6,7 @@ Of what `experiments.sweep` measured. Cost: combining, and the denoised images t
 takes, in units of the time of one denoising by Open Image Denoise in the same run.
 Error: relative L2 divided by that of the better of path tracing and the denoised image;
 geometric mean over scenes, seeds averaged before. On the front is what nothing cheaper
-is as good as.
+is as good as. A combiner that was told the variance times a factor is another setting.
 """
 
 import dataclasses
@@ -18,9 +18,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from experiments.sweep import Record, read
+from experiments.sweep import Record, results
 
 INPUTS = ("path tracing", "oidn")
+_TIMES = ", variance x "
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +32,13 @@ class Config:
         results: lines of `experiments.sweep`.
         metric: a metric of theirs that every seed has.
         plot: picture to write.
+        quick: measure the quick sweep into the results first.
     """
 
     results: tyro.conf.Positional[pathlib.Path]
     metric: str = "relative L2"
     plot: pathlib.Path | None = None
+    quick: bool = False
 
 
 class Row(NamedTuple):
@@ -71,9 +74,8 @@ def table(records: list[Record], metric: str) -> dict[str, Row]:
     """
     cases: dict[tuple[str, int], dict[str, Record]] = {}
     for record in records:
-        if record["scale"] == 1:
-            case = cases.setdefault((record["scene"], record["spp"]), {})
-            case[record["combiner"]] = record
+        case = cases.setdefault((record["scene"], record["spp"]), {})
+        case[_setting(record)] = record
     for case, found in cases.items():
         if missing := set(INPUTS) - found.keys():
             raise ValueError(f"{case} has no results of {', '.join(sorted(missing))}")
@@ -100,6 +102,12 @@ def table(records: list[Record], metric: str) -> dict[str, Row]:
     return _with_front(rows)
 
 
+def _setting(record: Record) -> str:
+    """The combiner, and what the variance was multiplied by."""
+    name, scale = record["combiner"], record["scale"]
+    return name if scale == 1 or name in INPUTS else f"{name}{_TIMES}{scale:g}"
+
+
 def _with_front(rows: dict[str, Row]) -> dict[str, Row]:
     """Mark what nothing cheaper is as good as."""
     place = lambda row: (row.cost, row.mean)
@@ -111,7 +119,7 @@ def _with_front(rows: dict[str, Row]) -> dict[str, Row]:
 
 
 def draw(rows: dict[str, Row], path: pathlib.Path, metric: str) -> None:
-    """Cost against error, the front marked.
+    """Cost against error, the front marked; the variance as it is.
 
     Args:
         rows: by `table`.
@@ -119,7 +127,8 @@ def draw(rows: dict[str, Row], path: pathlib.Path, metric: str) -> None:
         metric: what the error is.
     """
     figure, axes = plt.subplots(figsize=(8, 5.5), layout="constrained")
-    shown = {name: row for name, row in rows.items() if name != "path tracing"}
+    named = lambda name: name != "path tracing" and _TIMES not in name
+    shown = {name: row for name, row in rows.items() if named(name)}
     front = sorted((r for r in shown.values() if r.front), key=lambda row: row.cost)
     axes.plot([r.cost for r in front], [r.mean for r in front], "C1--", zorder=1)
     for name, row in shown.items():
@@ -138,9 +147,9 @@ def main() -> None:
     """Print the table, and draw it."""
     config = tyro.cli(Config, description=__doc__)
     try:
-        rows = table(list(read(config.results).values()), config.metric)
-    except ValueError as error:
-        sys.exit(f"pareto: {error}")
+        rows = table(results(config.results, quick=config.quick), config.metric)
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"pareto: {' '.join(str(error).split())}")
     counts = list(next(iter(rows.values())).errors)
     print(f"| | {' | '.join(map(str, counts))} | mean | worst | cost | |")
     for name, row in rows.items():

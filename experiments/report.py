@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from experiments import convergence, equal_time, pareto
 from experiments.combiners import COMBINERS
-from experiments.sweep import Record, read
+from experiments.sweep import Record, results
 from jscomb import exr, metrics
 from jscomb.frame import Frame
 from jscomb.typing import Image
@@ -43,6 +43,7 @@ class Config:
         out: page to write.
         combiners: images to show of each frame.
         metric: of the table and the plots; one that every seed has.
+        quick: measure the quick sweep into the results first, and show its first frame.
     """
 
     results: tyro.conf.Positional[pathlib.Path]
@@ -58,6 +59,7 @@ class Config:
         "chosen",
     )
     metric: str = "relative L2"
+    quick: bool = False
 
 
 def encoded(image: Image) -> str:
@@ -217,10 +219,12 @@ def run(config: Config) -> pathlib.Path:
     Raises:
         ValueError: if there are no results, no frames, or a frame without a reference.
     """
-    records = list(read(config.results).values())
-    if not records or not config.frames:
-        raise ValueError(f"{config.results} has no results, or no --frames were given")
-    made = [shown(path, config.combiners) for path in tqdm(config.frames, unit="frame")]
+    records, frames = results(config.results, quick=config.quick), config.frames
+    if config.quick:
+        frames = tuple(sorted(config.results.with_suffix("").glob("*-4-0.exr")))
+    if not frames:
+        raise ValueError("no --frames to show")
+    made = [shown(path, config.combiners) for path in tqdm(frames, unit="frame")]
     config.out.write_text(page(records, made, config.metric))
     return config.out
 

@@ -308,6 +308,26 @@ def read(path: pathlib.Path) -> dict[str, Record]:
     return found
 
 
+def results(path: pathlib.Path, *, quick: bool = False) -> list[Record]:
+    """What an experiment that only reads results begins with.
+
+    Args:
+        path: file of JSON lines.
+        quick: measure the quick sweep into it first, in a folder beside it.
+
+    Returns:
+        the records.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if quick:
+        run(Config(path.with_suffix(""), path, quick=True))
+    if not (found := read(path)):
+        raise ValueError(f"{path} has no results of experiments.sweep")
+    return list(found.values())
+
+
 def run(
     config: Config, *, change: Callable[[Case], Case] = lambda case: case
 ) -> list[Record]:

@@ -1,6 +1,7 @@
 """The page holds what was measured, and its viewer works in a browser, from a file."""
 
 import base64
+import json
 import re
 import shutil
 
@@ -118,6 +119,9 @@ def test_viewer_works_in_a_browser(browser, page):
 
 
 def test_bad_input(tmp_path):
-    (tmp_path / "r.jsonl").write_text("")
-    with pytest.raises(ValueError, match="has no results, or no --frames"):
-        report.run(report.Config(tmp_path / "r.jsonl"))
+    results = tmp_path / "r.jsonl"
+    with pytest.raises(ValueError, match="has no results of experiments"):
+        report.run(report.Config(results))
+    results.write_text(json.dumps({"key": "k"} | LINES[0]))
+    with pytest.raises(ValueError, match="no --frames"):
+        report.run(report.Config(results))

@@ -64,6 +64,8 @@ def test_sweep_measures_once(archive, glass_frame):
     seconds = found["whitened 7x7", 1.0]["seconds"]
     assert seconds["sampling"] is None
     assert min(seconds["denoising"], seconds["combining"]) > 0
+    rows = pareto.table(records, "RMSE")
+    assert rows.keys() == {*FEW, "whitened 7x7, variance x 4"}
     before = archive.results.read_text()
     assert sweep.run(archive) == records
     assert archive.results.read_text() == before
