@@ -13,6 +13,7 @@ from experiments import (
     equal_time,
     pareto,
     pixels,
+    report,
     stability,
     sweep,
 )
@@ -80,21 +81,13 @@ def test_sweep_goes_on_after_a_line_cut_short(archive):
     assert kept.keys() == {r["key"] for r in records}
 
 
-def test_sweep_renders_seeds(vectorised, tmp_path):
-    config = sweep.Config(
-        tmp_path,
-        tmp_path / "r.jsonl",
-        scenes=("cornell-box",),
-        spp=(4, 16),
-        seeds=2,
-        size=16,
-        reference_spp=32,
-        combiners=FEW[:2],
-        repeats=1,
-    )
-    records = sweep.run(config)
-    assert len(records) == 4
-    few, many = (r["errors"]["RMSE"] for r in records if r["combiner"] == FEW[0])
+def test_quick_form_renders_seeds(vectorised, tmp_path):
+    path = tmp_path / "r.jsonl"
+    page = report.Config(path, out=tmp_path / "r.html", combiners=FEW, quick=True)
+    assert "cornell-box-32-4-0" in report.run(page).read_text()
+    records = sweep.results(path)
+    of_x = [r for r in records if r["combiner"] == FEW[0] and r["scale"] == 1]
+    few, many = (r["errors"]["RMSE"] for r in of_x)
     assert few[0] != few[1]
     assert np.mean(many) < np.mean(few)
     found = equal_time.curves(records, "RMSE")["cornell-box"]
