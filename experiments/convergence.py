@@ -6,7 +6,8 @@ Of what `experiments.sweep` measured: the slope of log error against log samples
 unbiased), by least squares over the sample counts, and the ratio to path tracing at the
 last one (NJS figures 1, 8, 11, 13, 14, 16). With `--biased` frames of the sweep's work
 folder are combined with a severely biased image instead: path tracing, blurred by a
-15x15 box (figures 5, 6); a combiner that dominates stays below path tracing.
+15x15 box (figures 5, 6); a combiner that dominates stays below path tracing. Give these
+results a file of their own: other experiments would average over both.
 """
 
 import dataclasses
@@ -34,9 +35,10 @@ class Config:
     Attributes:
         results: lines of `experiments.sweep`.
         metric: a metric of theirs that every seed has.
-        biased: the sweep's work folder, to measure dominance on its frames; the results
-            are added to the lines, as scenes whose names end in " blurred".
+        biased: the sweep's work folder, to measure dominance on its frames; what is
+            missing in the results is measured first.
         plot: picture to write.
+        combiners: whose curves to draw; all by default.
         quick: measure the quick sweep first; with `biased`, on its frames too.
     """
 
@@ -44,6 +46,7 @@ class Config:
     metric: str = "relative L2"
     biased: pathlib.Path | None = None
     plot: pathlib.Path | None = None
+    combiners: tuple[str, ...] = ()
     quick: bool = False
 
 
@@ -126,7 +129,12 @@ def slope(spp: np.ndarray, errors: np.ndarray) -> float:
 
 
 def draw(
-    found: dict, path: pathlib.Path, metric: str, *, along: str = "samples a pixel"
+    found: dict,
+    path: pathlib.Path,
+    metric: str,
+    *,
+    combiners: tuple[str, ...] = (),
+    along: str = "samples a pixel",
 ) -> None:
     """Log-log curves, a panel for each scene.
 
@@ -134,6 +142,7 @@ def draw(
         found: abscissae and errors by combiner, by scene.
         path: picture to write.
         metric: what the error is.
+        combiners: whose curves to draw; all by default.
         along: what the abscissae are.
     """
     columns = min(3, len(found))
@@ -148,9 +157,10 @@ def draw(
     for ax in axes.flat[len(found) :]:
         ax.axis("off")
     for ax, (scene, of_scene) in zip(axes.flat, found.items(), strict=False):
-        for number, (name, (spp, errors)) in enumerate(of_scene.items()):
+        for number, name in enumerate(combiners or of_scene):
             style = ("-", "--", ":")[number // 10 % 3]
-            ax.loglog(spp, errors, style, label=name, lw=2 if number < 2 else 1)
+            lw = 2 if number < 2 else 1
+            ax.loglog(*of_scene[name], style, label=name, lw=lw)
         ax.set(title=scene, xlabel=along, ylabel=metric)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
     figure.savefig(path, dpi=120)
@@ -173,7 +183,7 @@ def main() -> None:
             ratios = " ".join(f"{r:.3f}" for r in errors / of_x)
             print(f"| {name} | {slope(spp, errors):+.2f} | {ratios} |")
     if config.plot is not None:
-        draw(found, config.plot, config.metric)
+        draw(found, config.plot, config.metric, combiners=config.combiners)
 
 
 if __name__ == "__main__":

@@ -108,7 +108,8 @@ def main() -> None:
             cells = [f"{'>' if b else ''}{f:.1f}" for f, b in factors.values()]
             print(f"| {name} | {' | '.join(cells)} |")
     if config.plot is not None:
-        draw(found, config.plot, config.metric, along="seconds")
+        chosen = {"combiners": config.combiners, "along": "seconds"}
+        draw(found, config.plot, config.metric, **chosen)
 
 
 if __name__ == "__main__":

@@ -32,12 +32,14 @@ class Config:
         results: lines of `experiments.sweep`.
         metric: a metric of theirs that every seed has.
         plot: picture to write.
+        combiners: whose points or curves to draw; all by default.
         quick: measure the quick sweep into the results first.
     """
 
     results: tyro.conf.Positional[pathlib.Path]
     metric: str = "relative L2"
     plot: pathlib.Path | None = None
+    combiners: tuple[str, ...] = ()
     quick: bool = False
 
 
@@ -118,16 +120,24 @@ def _with_front(rows: dict[str, Row]) -> dict[str, Row]:
     }
 
 
-def draw(rows: dict[str, Row], path: pathlib.Path, metric: str) -> None:
+def draw(
+    rows: dict[str, Row],
+    path: pathlib.Path,
+    metric: str,
+    *,
+    combiners: tuple[str, ...] = (),
+) -> None:
     """Cost against error, the front marked; the variance as it is.
 
     Args:
         rows: by `table`.
         path: picture to write.
         metric: what the error is.
+        combiners: whose points to draw; all by default.
     """
     figure, axes = plt.subplots(figsize=(8, 5.5), layout="constrained")
-    named = lambda name: name != "path tracing" and _TIMES not in name
+    wanted = combiners or rows
+    named = lambda n: n in wanted and n != "path tracing" and _TIMES not in n
     shown = {name: row for name, row in rows.items() if named(name)}
     front = sorted((r for r in shown.values() if r.front), key=lambda row: row.cost)
     axes.plot([r.cost for r in front], [r.mean for r in front], "C1--", zorder=1)
@@ -158,7 +168,7 @@ def main() -> None:
         print(f"| {name} | {each} | {row.mean:.3f} | {row.worst:.2f} ", end="")
         print(f"| {row.cost:.2f} | {mark} |")
     if config.plot is not None:
-        draw(rows, config.plot, config.metric)
+        draw(rows, config.plot, config.metric, combiners=config.combiners)
 
 
 if __name__ == "__main__":

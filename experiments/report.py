@@ -14,6 +14,8 @@ import io
 import json
 import pathlib
 import sys
+from collections.abc import Container
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib as mpl
@@ -141,26 +143,29 @@ def table(rows: dict[str, pareto.Row]) -> str:
     return "<table>" + "\n".join(lines) + "</table>"
 
 
-def plots(records: list[Record], metric: str) -> list[str]:
+def plots(
+    records: list[Record], metric: str, *, combiners: Container[str]
+) -> list[str]:
     """All plots, as SVG.
 
     Args:
         records: of a sweep.
         metric: of the plots.
+        combiners: whose curves to draw.
 
     Returns:
         the elements.
     """
     rows = pareto.table(records, metric)
     drawn = [_svg(lambda file: pareto.draw(rows, file, metric))]
+    shown: dict[str, Any] = {
+        "combiners": tuple(name for name in rows if name in combiners)
+    }
     curves = convergence.curves(records, metric)
-    drawn.append(_svg(lambda file: convergence.draw(curves, file, metric)))
+    drawn.append(_svg(lambda file: convergence.draw(curves, file, metric, **shown)))
     if any(record["seconds"]["sampling"] is not None for record in records):
-        timed = equal_time.curves(records, metric)
-        along = "seconds"
-        drawn.append(
-            _svg(lambda file: convergence.draw(timed, file, metric, along=along))
-        )
+        timed, shown["along"] = equal_time.curves(records, metric), "seconds"
+        drawn.append(_svg(lambda file: convergence.draw(timed, file, metric, **shown)))
     return drawn
 
 
@@ -192,10 +197,12 @@ def page(records: list[Record], frames: list[dict], metric: str) -> str:
         " geometric mean over scenes, at each sample count. Its cost beside sampling,"
         " in units of one denoising. Marked: what nothing cheaper is as good as."
     )
+    # The curves of what is shown: of all combiners they could not be told apart.
+    drawn = plots(records, metric, combiners=frames[0]["images"])
     parts = {
         "about": html.escape(about),
         "table": table(pareto.table(records, metric)),
-        "plots": "\n".join(f"<figure>{svg}</figure>" for svg in plots(records, metric)),
+        "plots": "\n".join(f"<figure>{svg}</figure>" for svg in drawn),
         "low": f"{ERRORS[0]:g}",
         "high": f"{ERRORS[1]:g}",
         # Inside a script element only this could end it.
