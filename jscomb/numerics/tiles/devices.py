@@ -16,7 +16,6 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jscomb.numerics.tiles.crops import Images, length
 
-
 _AXIS = "rows"
 
 
