@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jscomb import james_stein, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
+from jscomb.numerics.tiles import Local
 from jscomb.typing import Image, Key, Variance
 
 KEEP = "kept"
@@ -79,39 +80,40 @@ UNTRAINED: dict[str, Callable[[Image, Image, Variance], Image]] = {
 the mean x, [H,W,C] each."""
 
 
-def _keep(key: Key, frame: Frame, name: str) -> Image:
+def _keep(key: Key, frame: Frame, name: str) -> Local:
     """The biased image as it is."""
     del key
-    return frame.biased[name].full
+    return Local(lambda y: y, frame.biased[name].full, 0)
 
 
-def _of_images(combine: Callable[[Image, Image, Variance], Image]) -> Callable:
-    """A method of a frame, from one of its images."""
-
-    def method(key: Key, frame: Frame, name: str) -> Image:
-        del key
-        return combine(frame.color, frame.biased[name].full, frame.variance)
-
-    return method
+def _untrained(key: Key, frame: Frame, name: str, *, method: str) -> Local:
+    """By an estimator without a network."""
+    del key
+    images = frame.color, frame.biased[name].full, frame.variance
+    return Local(lambda i: UNTRAINED[method](*i), images, _HALOS[method])
 
 
-def _learned(key: Key, frame: Frame, name: str, *, method: str) -> Image:
+def _learned(key: Key, frame: Frame, name: str, *, method: str) -> Local:
     """By a trained network."""
     from jscomb.learning import methods  # flax is slow to import
 
-    return methods.combine_frame(key, frame, name, method=method)
+    return methods.local(key, frame, name, method=method)
 
 
-METHODS: dict[str, Callable[[Key, Frame, str], Image]] = {
+# Windows twice: of the variance or the share, and of its mean.
+_HALOS = {"james-stein": 7 + 7, "whitened": 9 + 3 + 3}
+
+METHODS: dict[str, Callable[[Key, Frame, str], Local]] = {
     KEEP: _keep,
-    **{method: _of_images(combine) for method, combine in UNTRAINED.items()},
+    **{method: functools.partial(_untrained, method=method) for method in UNTRAINED},
     **{
         method: functools.partial(_learned, method=method)
         for method in ("njs", "pd", "dsc")
     },
 }
-"""Of a key, a frame and the name of its biased image, to the combination; the cheapest
-first. Some decide on values, so they are not for `jit`."""
+"""Of a key, a frame and the name of its biased image, to the combination as a function
+of what it takes; the cheapest first. Some decide on values, so they are not for `jit`.
+"""
 
 CANDIDATES = tuple(method for method in METHODS if method != "james-stein")
 """What `choose` tries: of the two without a network only the better one."""
@@ -124,11 +126,34 @@ def combine(key: Key, frame: Frame, name: str, *, method: str) -> Image:
         key: of random probes, a typed key.
         frame: with variance.
         name: of the biased image.
+        method: a key of `METHODS`.
+
+    Returns:
+        the combination, linear radiance, shape [H,W,C].
+
+    Raises:
+        ValueError: if there is no such method or biased image, or the frame lacks what
+            the method needs.
+        ImportError: for pd, if Open Image Denoise is not installed.
+    """
+    found = local(key, frame, name, method=method)
+    return found.function(found.images)
+
+
+def local(key: Key, frame: Frame, name: str, *, method: str) -> Local:
+    """A frame's combination as a function of what it takes: for large ones by crops.
+
+    What the whole frame decides, such as its exposure, is decided here.
+
+    Args:
+        key: of random probes, a typed key.
+        frame: with variance.
+        name: of the biased image.
         method: a key of `METHODS`: kept (the biased image as it is), james-stein,
             whitened, or by a trained network njs, pd, dsc.
 
     Returns:
-        the combination, linear radiance, shape [H,W,C].
+        the function and its images.
 
     Raises:
         ValueError: if there is no such method or biased image, or the frame lacks what

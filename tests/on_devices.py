@@ -1,4 +1,4 @@
-"""Run by test_tiles_large: a combiner on four devices, of one process or of two.
+"""Run by test_crops: a combiner on four devices, of one process or of two.
 
 python -m tests.on_devices [PROCESS COUNT ADDRESS]
 """

@@ -52,7 +52,7 @@ FUNCTIONS = [
     for name, f in inspect.getmembers(module, inspect.isfunction)
     if f.__module__ == module.__name__
     and not name.startswith("_")
-    and module.__name__ != "jscomb.cli"  # its docstrings are the command's help
+    and not module.__name__.startswith("jscomb.cli")  # the command's help
 ]
 
 
@@ -78,7 +78,7 @@ def imports_of(path: pathlib.Path) -> set[str]:
 def test_imports_flow_one_way(module):
     ours = imports_of(pathlib.Path(module.__file__))
     below = {name for name in ours if room(name) > room(module.__name__)}
-    if module.__name__ == "jscomb.cli":
+    if module.__name__.startswith("jscomb.cli"):
         below -= {"jscomb"}  # for the version
     assert not below
     name = module.__name__.split(".")[1]

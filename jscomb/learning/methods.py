@@ -22,12 +22,16 @@ from jscomb.features import stack
 from jscomb.frame import Frame
 from jscomb.learning import files, losses, networks
 from jscomb.numerics.sure import monte_carlo_sure
+from jscomb.numerics.tiles import Local
 from jscomb.typing import Image, Key, Scalar
 
 Inputs = dict[str, Image]
 Network = Any  # a pytree of parameters that can be called
 
 _STRIDE = 2  # of regressions
+_BLOCK = 4  # pixels that a U-Net pools to one
+# Two convolutions of 3x3 on each way through levels of pixels, pairs and blocks.
+_U_NET = 2 * (2 * 1 + 2 * 2) + 2 * _BLOCK + _BLOCK - 1
 
 
 class Method(NamedTuple):
@@ -41,6 +45,7 @@ class Method(NamedTuple):
         loss: of an image and a reference.
         other: likewise, what training may draw as well; None if there is no such thing.
         training: options of `combine` to train by.
+        halo: pixels around a pixel that `combine` sees of the inputs.
     """
 
     network: Callable[..., Network]
@@ -49,6 +54,7 @@ class Method(NamedTuple):
     loss: Callable[[Image, Image], Scalar]
     other: Callable[[Key, Frame, str], Inputs] | None = None
     training: Mapping[str, Any] = types.MappingProxyType({})
+    halo: int = 0
 
 
 def _james_stein(key: Key, frame: Frame, name: str) -> Inputs:
@@ -183,12 +189,14 @@ METHODS = {
         ),
         losses.log_l2,
         _other_james_stein,
+        halo=_U_NET + 1 + 7 + 2 * 3,  # its head, kernels of 15x15, windows of 7x7 twice
     ),
     "dsc": Method(
         networks.ShrinkageNetwork,
         _double_shrinkage,
         _of_arrays(double_shrinkage.neural_combine),
         metrics.smape,
+        halo=_U_NET + 6,  # kernels of 13x13
     ),
     "pd": Method(
         networks.MixingNetwork,
@@ -203,6 +211,7 @@ METHODS = {
         losses.log_l2,
         exchanged(_progressive),
         {"activate": functools.partial(progressive.direct_activation, beyond=0.0)},
+        halo=7,  # a convolution of 5x5 and five of 3x3
     ),
 }
 """The combiners whose trained parameters come with the package. Away from the papers,
@@ -272,6 +281,29 @@ def combine_frame(
 ) -> Image:
     """Combine a frame with one of its biased images by a trained network.
 
+    Args:
+        key: of random probes.
+        frame: with variance and three channels.
+        name: of the biased image.
+        method: njs, dsc or pd.
+        network: None for the one that comes with the package.
+
+    Returns:
+        the combination, linear radiance, shape [H,W,C].
+
+    Raises:
+        ValueError: if the frame lacks what the method needs.
+        ImportError: for pd, if Open Image Denoise is not installed.
+    """
+    found = local(key, frame, name, method=method, network=network)
+    return found.function(found.images)
+
+
+def local(
+    key: Key, frame: Frame, name: str, *, method: str, network: Network | None = None
+) -> Local:
+    """A frame's combination by a trained network as a function of what it takes.
+
     Decides on values (features that tell nothing, whether to regress), so it is not for
     `jit`.
 
@@ -284,7 +316,7 @@ def combine_frame(
         network: None for the one that comes with the package.
 
     Returns:
-        the combination, linear radiance, shape [H,W,C].
+        the function and its images, for large ones by crops.
 
     Raises:
         ValueError: if the frame lacks what the method needs.
@@ -296,9 +328,12 @@ def combine_frame(
         raise ValueError(
             f"the networks want three channels, got {frame.color.shape[-1]}"
         )
-    inputs = _known(method).inputs(key, frame, name)
+    chosen = _known(method)
+    inputs = chosen.inputs(key, frame, name)
     network = shipped(method) if network is None else network
-    return frame.exposure * _combine(network, inputs, method=method)
+    unit = frame.exposure
+    function = lambda inputs: unit * _combine(network, inputs, method=method)
+    return Local(function, inputs, chosen.halo, _BLOCK)
 
 
 @functools.partial(jax.jit, static_argnames="method")

@@ -1,6 +1,7 @@
 """Large images in parts: cut, worked on, and put together again."""
 
 from jscomb.numerics.tiles.crops import Crop as Crop
+from jscomb.numerics.tiles.crops import Local as Local
 from jscomb.numerics.tiles.crops import crops as crops
 from jscomb.numerics.tiles.crops import map_crops as map_crops
 from jscomb.numerics.tiles.crops import stream_crops as stream_crops

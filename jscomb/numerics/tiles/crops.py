@@ -21,6 +21,23 @@ from jax import lax
 Images = Any  # pytree of [H,W,...]
 
 
+class Local(NamedTuple):
+    """A local function and what it is of, such as a combiner of a frame.
+
+    Attributes:
+        function: of images, or of crops of them, to an image of their size.
+        images: a tree of arrays [H,W,...].
+        halo: pixels around a pixel that its result depends on.
+        multiple: what crops have to start at multiples of; more than one for functions
+            that treat pixels by blocks, such as a network that pools.
+    """
+
+    function: Callable[[Images], Any]
+    images: Images
+    halo: int
+    multiple: int = 1
+
+
 class Span(NamedTuple):
     """A tile and its crop along one axis, in pixels.
 
@@ -28,13 +45,13 @@ class Span(NamedTuple):
         start: of the crop, in the image.
         size: of the crop.
         first: of the tile's pixels, in the crop.
-        count: of the tile's pixels.
+        pixels: of the tile.
     """
 
     start: int
     size: int
     first: int
-    count: int
+    pixels: int
 
     @property
     def crop(self) -> slice:
@@ -44,12 +61,12 @@ class Span(NamedTuple):
     @property
     def own(self) -> slice:
         """The tile, in the image."""
-        return slice(self.start + self.first, self.start + self.first + self.count)
+        return slice(self.start + self.first, self.start + self.first + self.pixels)
 
     @property
     def inner(self) -> slice:
         """The tile, in the crop."""
-        return slice(self.first, self.first + self.count)
+        return slice(self.first, self.first + self.pixels)
 
 
 class Crop(NamedTuple):
@@ -258,6 +275,7 @@ def tile_within(
 
     Raises:
         ValueError: if not even a crop with a tile as wide as its halo has room.
+        RuntimeError: if the backend does not tell.
     """
     height, width = jax.tree.leaves(images)[0].shape[:2]
     largest = max(height, width)
@@ -288,4 +306,6 @@ def _memory(
     like = lambda i: jax.ShapeDtypeStruct((*size, *i.shape[2:]), i.dtype)
     used = jax.jit(function).lower(jax.tree.map(like, images)).compile()
     of = used.memory_analysis()
+    if of is None:
+        raise RuntimeError("this backend does not tell what memory a program takes")
     return of.temp_size_in_bytes + of.argument_size_in_bytes + of.output_size_in_bytes

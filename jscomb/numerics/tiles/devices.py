@@ -25,7 +25,7 @@ def map_shards(
     *,
     halo: int,
     multiple: int = 1,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> Any:
     """Apply a local function with every device at work on its rows.
 

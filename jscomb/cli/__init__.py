@@ -1,0 +1,68 @@
+"""The command `jscomb`: combine, compare and describe rendered frames.
+
+Errors of the input are one line on standard error and exit status 2.
+"""
+
+import contextlib
+import functools
+import io
+import os
+import re
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import tyro
+
+from jscomb.cli.combining import combine
+from jscomb.cli.showing import compare, demo, info
+
+
+def main() -> None:
+    """Run the command; the entry point of `jscomb`."""
+    _use_compilation_cache()
+    try:
+        _parse()()
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        print("jscomb:", " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
+
+
+def _parse() -> Callable[[], None]:
+    """The command line as a call to make; a wrong one is a `ValueError`."""
+
+    def later(command: Callable) -> Callable:
+        @functools.wraps(command)
+        def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
+            return lambda: command(*args, **kwargs)
+
+        return bind
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.extras.subcommand_cli_from_dict(
+                {c.__name__: later(c) for c in (demo, combine, compare, info)},
+                prog="jscomb",
+                description="Combine unbiased and biased Monte Carlo renderings.",
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise  # --help
+        text = re.sub(r"\x1b\[[0-9;]*m|[^\x00-\x7f]", " ", said.getvalue())
+        raise ValueError(text.replace("-" * 8, "")) from None
+
+
+def _use_compilation_cache() -> None:
+    """Keep compiled programs in the user's cache, so the second run starts fast."""
+    if jax.__version_info__ < (0, 10, 2):
+        return  # it would complain of every program that it finds there
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        folder = os.path.join(cache, "jscomb", "xla")
+        jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
