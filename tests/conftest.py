@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import sys
 
 import jax
 import jaxtyping
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments import scenes
-from jscomb import exr
+from jscomb import cli, exr
 from jscomb.frame import CHANNELS
 
 jax.config.update("jax_enable_x64", True)
@@ -40,6 +41,23 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def jscomb(monkeypatch, capsys):
+    """Run the command in this process; returns status, output and error."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["jscomb", *map(os.fspath, arguments)])
+        monkeypatch.setattr(cli, "_use_compilation_cache", lambda: None)
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(scope="module")

@@ -8,30 +8,13 @@ import sys
 import numpy as np
 import pytest
 
-from jscomb import choice, cli, exr, metrics
+from jscomb import choice, exr, metrics
 from jscomb.frame import Biased
 from jscomb.numerics.guards import finite
 from tests.conftest import DATA
 from tests.test_exr import layer, noise, write
 
 GLASS = DATA / "cornell-glass-64.exr"
-
-
-@pytest.fixture
-def jscomb(monkeypatch, capsys):
-    """Run the command in this process; returns status, output and error."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["jscomb", *map(os.fspath, arguments)])
-        monkeypatch.setattr(cli, "_use_compilation_cache", lambda: None)
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run
 
 
 def errors_in(text, column=0):

@@ -1,0 +1,100 @@
+"""`jscomb combine` of many frames and of large ones."""
+
+import os
+
+import jax
+import numpy as np
+import pytest
+
+from jscomb import choice, exr
+from jscomb.cli import combining
+from jscomb.numerics import tiles
+from tests.conftest import DATA
+
+GLASS, BOX = (DATA / f"cornell-{name}-64.exr" for name in ("glass", "box"))
+
+
+@pytest.mark.parametrize("method", choice.METHODS)
+def test_methods_are_local(method, glass_frame):
+    """By crops as a whole; with a pixel less around them, somewhere not."""
+    found = choice.local(jax.random.key(0), glass_frame, "oidn", method=method)
+    whole = np.asarray(found.function(found.images))
+    made = np.empty_like(whole)
+    for where, part in tiles.stream_crops(**found._asdict(), tile=17):
+        made[where] = part
+    np.testing.assert_allclose(made, whole, rtol=1e-9, atol=1e-12)
+
+
+@pytest.fixture
+def small_crops(monkeypatch):
+    """Every frame is a large one."""
+    monkeypatch.setattr(combining, "LARGE", 1000)
+    monkeypatch.setattr(combining, "SAMPLED", 24)
+
+
+def test_large_frames_are_the_same(jscomb, small_crops, monkeypatch, tmp_path):
+    wide = tmp_path / "wide.exr"
+    status, said, _ = jscomb("combine", GLASS, "-o", wide, "--method", "whitened")
+    assert status == 0
+    seen = []
+    within = tiles.tile_within
+    keep = lambda *args, **options: seen.append(within(*args, **options)) or 20
+    monkeypatch.setattr(tiles, "tile_within", keep)
+    crops = tmp_path / "crops.exr"
+    assert jscomb("combine", GLASS, "-o", crops, "--method", "whitened")[0] == 0
+    assert seen == [64]
+    np.testing.assert_allclose(
+        exr.read_image(crops), exr.read_image(wide), rtol=1e-5, atol=1e-7
+    )
+    status, said, _ = jscomb("combine", GLASS, "-o", crops)  # chooses by a sample
+    assert status == 0
+    assert "by the half buffers, whitened" in said
+    status, _, said = jscomb("combine", GLASS, "-o", crops, "--memory", "0")
+    assert status == 2
+    assert "the budget is 0 MiB" in said
+
+
+def test_sequences_go_on(jscomb, tmp_path):
+    """Past a bad frame, and after an interruption."""
+    bad, out = tmp_path / "bad.exr", tmp_path / "out"
+    bad.write_bytes(GLASS.read_bytes()[:5000])
+    command = ["combine", GLASS, bad, BOX, "-o", out, "--method", "whitened"]
+    status, said, wrong = jscomb(*command)
+    assert status == 2
+    assert wrong.strip().endswith("1 of 3 frames failed: bad.exr")
+    assert str(bad) in wrong
+    made = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert made.keys() == {GLASS.name, BOX.name}
+    (out / BOX.name).unlink()
+    bad.write_bytes(BOX.read_bytes())
+    status, said, _ = jscomb(*command)
+    assert status == 0
+    assert said.count("is there already") == 1
+    again = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert again[GLASS.name] == made[GLASS.name]
+    assert again.keys() == {GLASS.name, BOX.name, "bad.exr"}
+    np.testing.assert_array_equal(
+        exr.read_image(out / "bad.exr"), exr.read_image(out / BOX.name)
+    )
+
+
+def test_what_has_changed_is_made_anew(jscomb, tmp_path):
+    frame, out = tmp_path / "f.exr", tmp_path / "out"
+    out.mkdir()
+    frame.write_bytes(GLASS.read_bytes())
+    command = ["combine", frame, "-o", out, "--method"]
+    assert "there already" not in jscomb(*command, "whitened")[1]
+    assert "there already" in jscomb(*command, "whitened")[1]
+    assert "there already" not in jscomb(*command, "kept")[1]
+    os.utime(frame, ns=(0, 0))
+    assert "there already" not in jscomb(*command, "kept")[1]
+    (out / "f.exr").write_bytes(b"no image")
+    assert "there already" not in jscomb(*command, "kept")[1]
+
+
+def test_names_must_differ(jscomb, tmp_path):
+    other = tmp_path / GLASS.name
+    other.write_bytes(b"")
+    status, _, said = jscomb("combine", GLASS, other, "-o", tmp_path / "out")
+    assert status == 2
+    assert f"several frames would be written as {GLASS.name}" in said
