@@ -12,10 +12,12 @@ Times are medians on one frame after a warm-up: of one sample a pixel, of denois
 frame once, and of combining; compilation is the first call less the median.
 """
 
+import concurrent.futures
 import dataclasses
 import functools
 import hashlib
 import json
+import multiprocessing
 import pathlib
 import statistics
 import sys
@@ -122,8 +124,7 @@ def cases(config: Config) -> Iterator[Case]:
                 frame = frames.load(path, spp)
                 yield Case(path.stem, spp, [frame.scaled(1 / frame.exposure)], None)
             continue
-        files = _rendered(config, scene)
-        seconds = _sampling(config, scene)
+        files, seconds = _apart(_rendered, config, scene)
         for spp, seeds in files.items():
             yield Case(scene, spp, _of_files(seeds), seconds)
 
@@ -136,8 +137,23 @@ def _of_files(paths: list[pathlib.Path]) -> list[Frame]:
     return [frame.scaled(1 / unit) for frame in read]
 
 
-def _rendered(config: Config, scene: str) -> dict[int, list[pathlib.Path]]:
-    """Files of every sample count and seed; those that are missing are rendered."""
+def _apart(function: Callable, *arguments: Any) -> Any:
+    """The function's result from a process of its own.
+
+    Where Mitsuba and XLA have both compiled code, an exception may end the process.
+    """
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def _rendered(
+    config: Config, scene: str
+) -> tuple[dict[int, list[pathlib.Path]], float]:
+    """Files of every sample count and seed, and the seconds of a sample a pixel.
+
+    Those files that are missing are rendered.
+    """
     config.work.mkdir(parents=True, exist_ok=True)
     stem = f"{pathlib.Path(scene).stem}-{config.size}"
     reference = config.work / f"{stem}-reference-{config.reference_spp}.exr"
@@ -154,7 +170,7 @@ def _rendered(config: Config, scene: str) -> dict[int, list[pathlib.Path]]:
                 render.run(of(out=out, spp=spp, seed=stream, reference_from=reference))
             stream += 10 * spp + 1000
             files[spp].append(out)
-    return files
+    return files, _sampling(config, scene)
 
 
 def _sampling(config: Config, scene: str) -> float:
@@ -205,13 +221,16 @@ def errors(image: Image, frame: Frame, *, displayed: bool) -> dict[str, float]:
     return {name: float(measure()) for name, measure in measures.items()}
 
 
-def measure(case: Case, name: str, config: Config) -> Iterator[Record]:
+def measure(
+    case: Case, name: str, config: Config, *, denoising: float
+) -> Iterator[Record]:
     """Measure a combiner on all seeds of a case.
 
     Args:
         case: the frames.
         name: key of `COMBINERS`.
         config: scales and repeats.
+        denoising: seconds of Open Image Denoise on a frame.
 
     Yields:
         one record for each factor of the variance.
@@ -246,7 +265,7 @@ def measure(case: Case, name: str, config: Config) -> Iterator[Record]:
             },
             "seconds": {
                 "sampling": None if case.sample is None else case.sample * case.spp,
-                "denoising": chosen.denoised * _denoising(seeds[0], config.repeats),
+                "denoising": chosen.denoised * denoising,
                 "combining": seconds,
                 "compiling": compiling,
             },
@@ -348,12 +367,16 @@ def run(
     bar = tqdm(unit="combiner")
     for case in map(change, cases(config)):
         pixels = digest_of(case)
+        # Once for all combiners, whose costs are compared.
+        of_case = functools.partial(_denoising, case.frames[0], config.repeats)
+        denoising = functools.cache(of_case)
         for name in config.combiners:
             bar.set_description(f"{case.scene} {case.spp} {name}")
             scales = config.scales if COMBINERS[name].traced else (1.0,)
             keys = [key_of(pixels, name, scale, config.repeats) for scale in scales]
             if any(key not in done for key in keys):
-                new = zip(keys, measure(case, name, config), strict=True)
+                made = measure(case, name, config, denoising=denoising())
+                new = zip(keys, made, strict=True)
                 _append(config.results, [{"key": key, **record} for key, record in new])
                 done = read(config.results)
             records += [done[key] for key in keys]
