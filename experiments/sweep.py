@@ -9,7 +9,8 @@ that it depends on: the same command goes on where it was interrupted, and what 
 is not measured again. Other experiments read these lines.
 
 Times are medians on one frame after a warm-up: of one sample a pixel, of denoising the
-frame once, and of combining; compilation is the first call less the median.
+frame once, and of combining. Compilation, in the first case of a size, is the first
+call less the median.
 """
 
 import concurrent.futures
@@ -239,12 +240,10 @@ def measure(
     scales = config.scales if chosen.traced else (1.0,)
     # One frame's time is what a user waits for, not its share of a batch.
     if chosen.traced:
-        one = jax.jit(chosen.combine)
+        one, batch = _compiled(name)
         once = lambda: one(seeds[0], jnp.float32(1))
-        over_seeds = jax.vmap(chosen.combine, (0, None))
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
-        both = jax.jit(jax.vmap(over_seeds, (None, 0)))
-        images = both(stacked, jnp.asarray(scales, jnp.float32))
+        images = batch(stacked, jnp.asarray(scales, jnp.float32))
     else:
         once = lambda: chosen.combine(seeds[0])
         images = jnp.stack([chosen.combine(frame) for frame in seeds])[None]
@@ -270,6 +269,17 @@ def measure(
                 "compiling": compiling,
             },
         }
+
+
+@functools.cache
+def _compiled(name: str) -> tuple[Callable, Callable]:
+    """A traced combiner for one frame, and vmapped over factors and seeds.
+
+    Kept: compiled anew for every case, programs that were given up made libgcc crash.
+    """
+    combine = COMBINERS[name].combine
+    over_seeds = jax.vmap(combine, (0, None))
+    return jax.jit(combine), jax.jit(jax.vmap(over_seeds, (None, 0)))
 
 
 def _denoising(frame: Frame, repeats: int) -> float:
