@@ -6,7 +6,8 @@ Of what `experiments.sweep` measured. Cost: combining, and the denoised images t
 takes, in units of the time of one denoising by Open Image Denoise in the same run.
 Error: relative L2 divided by that of the better of path tracing and the denoised image;
 geometric mean over scenes, seeds averaged before. On the front is what nothing cheaper
-is as good as. A combiner that was told the variance times a factor is another setting.
+is as good as; costs within a tenth are equal. A combiner that was told the variance
+times a factor is another setting.
 """
 
 import dataclasses
@@ -17,11 +18,14 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
 
 from experiments.sweep import Record, results
 
 INPUTS = ("path tracing", "oidn")
 _TIMES = ", variance x "
+_WORST = 1.6  # of the plot
+_EQUAL = 1.1  # times on a shared machine differ as much
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,8 +116,10 @@ def _setting(record: Record) -> str:
 
 def _with_front(rows: dict[str, Row]) -> dict[str, Row]:
     """Mark what nothing cheaper is as good as."""
-    place = lambda row: (row.cost, row.mean)
-    better = lambda a, b: a.cost <= b.cost and a.mean <= b.mean and place(a) != place(b)
+    better = lambda a, b: (
+        (a.cost <= _EQUAL * b.cost and a.mean < b.mean)
+        or (_EQUAL * a.cost < b.cost and a.mean <= b.mean)
+    )
     return {
         name: row._replace(front=not any(better(r, row) for r in rows.values()))
         for name, row in rows.items()
@@ -127,7 +133,10 @@ def draw(
     *,
     combiners: tuple[str, ...] = (),
 ) -> None:
-    """Cost against error, the front marked; the variance as it is.
+    """Cost against error, the front marked.
+
+    Of settings with another variance only those on the front have names. What is worse
+    than `_WORST` is drawn there, with its error.
 
     Args:
         rows: by `table`.
@@ -135,22 +144,45 @@ def draw(
         metric: what the error is.
         combiners: whose points to draw; all by default.
     """
-    figure, axes = plt.subplots(figsize=(8, 5.5), layout="constrained")
-    wanted = combiners or rows
-    named = lambda n: n in wanted and n != "path tracing" and _TIMES not in n
-    shown = {name: row for name, row in rows.items() if named(name)}
+    figure, axes = plt.subplots(figsize=(9, 6), layout="constrained")
+    shown = {
+        name: row
+        for name, row in rows.items()
+        if name != "path tracing" and name.split(_TIMES)[0] in (combiners or rows)
+    }
     front = sorted((r for r in shown.values() if r.front), key=lambda row: row.cost)
     axes.plot([r.cost for r in front], [r.mean for r in front], "C1--", zorder=1)
+    beside = []
     for name, row in shown.items():
-        axes.plot(row.cost, row.mean, "o", color="C1" if row.front else "C0")
-        axes.annotate(
-            name, (row.cost, row.mean), (4, 4), textcoords="offset points", fontsize=7
-        )
+        place = row.cost, min(row.mean, _WORST)
+        named = row.front or _TIMES not in name
+        color = "C1" if row.front else "C0" if named else "0.8"
+        axes.plot(*place, "o" if row.mean < _WORST else "^", color=color)
+        name += "" if row.mean < _WORST else f" ({row.mean:.1f})"
+        if named and row.cost < 1.2:
+            beside.append((place, name))
+        elif named:
+            axes.annotate(name, place, (4, 4), textcoords="offset points", fontsize=8)
+    _annotate_beside(axes, beside)
     axes.axhline(1, color="0.7", zorder=0)
-    axes.set(xscale="log", yscale="log", xlabel="cost in denoisings")
+    axes.set(xscale="log", xlabel="cost in denoisings", xlim=(0.4, 2 * front[-1].cost))
     axes.set(ylabel=f"{metric} / that of the better input")
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def _annotate_beside(axes: Axes, points: list[tuple[tuple[float, float], str]]) -> None:
+    """Names in a column to the left: many combiners cost hardly more than denoising."""
+    for number, (place, name) in enumerate(sorted(points, key=lambda p: p[0][1])):
+        axes.annotate(
+            name,
+            place,
+            (0.02, (number + 1) / (len(points) + 1)),
+            textcoords="axes fraction",
+            fontsize=8,
+            va="center",
+            arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "0.6"},
+        )
 
 
 def main() -> None:

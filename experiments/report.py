@@ -192,7 +192,7 @@ def page(records: list[Record], frames: list[dict], metric: str) -> str:
     scenes = sorted({record["scene"] for record in records})
     seeds = max(len(record["errors"][metric]) for record in records)
     about = (
-        f"{metric} of every combiner on {', '.join(scenes)}, mean of {seeds} seed(s),"
+        f"The {metric} of every combiner on {', '.join(scenes)}, mean of {seeds} seeds,"
         " divided by that of the better of path tracing and Open Image Denoise:"
         " geometric mean over scenes, at each sample count. Its cost beside sampling,"
         " in units of one denoising. Marked: what nothing cheaper is as good as."

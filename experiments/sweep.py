@@ -9,13 +9,16 @@ that it depends on: the same command goes on where it was interrupted, and what 
 is not measured again. Other experiments read these lines.
 
 Times are medians on one frame after a warm-up: of one sample a pixel, of denoising the
-frame once, and of combining; compilation is the first call less the median.
+frame once, and of combining. Compilation, in the first case of a size, is the first
+call less the median.
 """
 
+import concurrent.futures
 import dataclasses
 import functools
 import hashlib
 import json
+import multiprocessing
 import pathlib
 import statistics
 import sys
@@ -122,8 +125,7 @@ def cases(config: Config) -> Iterator[Case]:
                 frame = frames.load(path, spp)
                 yield Case(path.stem, spp, [frame.scaled(1 / frame.exposure)], None)
             continue
-        files = _rendered(config, scene)
-        seconds = _sampling(config, scene)
+        files, seconds = _apart(_rendered, config, scene)
         for spp, seeds in files.items():
             yield Case(scene, spp, _of_files(seeds), seconds)
 
@@ -136,8 +138,23 @@ def _of_files(paths: list[pathlib.Path]) -> list[Frame]:
     return [frame.scaled(1 / unit) for frame in read]
 
 
-def _rendered(config: Config, scene: str) -> dict[int, list[pathlib.Path]]:
-    """Files of every sample count and seed; those that are missing are rendered."""
+def _apart(function: Callable, *arguments: Any) -> Any:
+    """The function's result from a process of its own.
+
+    Where Mitsuba and XLA have both compiled code, an exception may end the process.
+    """
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def _rendered(
+    config: Config, scene: str
+) -> tuple[dict[int, list[pathlib.Path]], float]:
+    """Files of every sample count and seed, and the seconds of a sample a pixel.
+
+    Those files that are missing are rendered.
+    """
     config.work.mkdir(parents=True, exist_ok=True)
     stem = f"{pathlib.Path(scene).stem}-{config.size}"
     reference = config.work / f"{stem}-reference-{config.reference_spp}.exr"
@@ -154,7 +171,7 @@ def _rendered(config: Config, scene: str) -> dict[int, list[pathlib.Path]]:
                 render.run(of(out=out, spp=spp, seed=stream, reference_from=reference))
             stream += 10 * spp + 1000
             files[spp].append(out)
-    return files
+    return files, _sampling(config, scene)
 
 
 def _sampling(config: Config, scene: str) -> float:
@@ -205,13 +222,16 @@ def errors(image: Image, frame: Frame, *, displayed: bool) -> dict[str, float]:
     return {name: float(measure()) for name, measure in measures.items()}
 
 
-def measure(case: Case, name: str, config: Config) -> Iterator[Record]:
+def measure(
+    case: Case, name: str, config: Config, *, denoising: float
+) -> Iterator[Record]:
     """Measure a combiner on all seeds of a case.
 
     Args:
         case: the frames.
         name: key of `COMBINERS`.
         config: scales and repeats.
+        denoising: seconds of Open Image Denoise on a frame.
 
     Yields:
         one record for each factor of the variance.
@@ -220,12 +240,10 @@ def measure(case: Case, name: str, config: Config) -> Iterator[Record]:
     scales = config.scales if chosen.traced else (1.0,)
     # One frame's time is what a user waits for, not its share of a batch.
     if chosen.traced:
-        one = jax.jit(chosen.combine)
+        one, batch = _compiled(name)
         once = lambda: one(seeds[0], jnp.float32(1))
-        over_seeds = jax.vmap(chosen.combine, (0, None))
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
-        both = jax.jit(jax.vmap(over_seeds, (None, 0)))
-        images = both(stacked, jnp.asarray(scales, jnp.float32))
+        images = batch(stacked, jnp.asarray(scales, jnp.float32))
     else:
         once = lambda: chosen.combine(seeds[0])
         images = jnp.stack([chosen.combine(frame) for frame in seeds])[None]
@@ -246,11 +264,22 @@ def measure(case: Case, name: str, config: Config) -> Iterator[Record]:
             },
             "seconds": {
                 "sampling": None if case.sample is None else case.sample * case.spp,
-                "denoising": chosen.denoised * _denoising(seeds[0], config.repeats),
+                "denoising": chosen.denoised * denoising,
                 "combining": seconds,
                 "compiling": compiling,
             },
         }
+
+
+@functools.cache
+def _compiled(name: str) -> tuple[Callable, Callable]:
+    """A traced combiner for one frame, and vmapped over factors and seeds.
+
+    Kept: compiled anew for every case, programs that were given up made libgcc crash.
+    """
+    combine = COMBINERS[name].combine
+    over_seeds = jax.vmap(combine, (0, None))
+    return jax.jit(combine), jax.jit(jax.vmap(over_seeds, (None, 0)))
 
 
 def _denoising(frame: Frame, repeats: int) -> float:
@@ -348,12 +377,16 @@ def run(
     bar = tqdm(unit="combiner")
     for case in map(change, cases(config)):
         pixels = digest_of(case)
+        # Once for all combiners, whose costs are compared.
+        of_case = functools.partial(_denoising, case.frames[0], config.repeats)
+        denoising = functools.cache(of_case)
         for name in config.combiners:
             bar.set_description(f"{case.scene} {case.spp} {name}")
             scales = config.scales if COMBINERS[name].traced else (1.0,)
             keys = [key_of(pixels, name, scale, config.repeats) for scale in scales]
             if any(key not in done for key in keys):
-                new = zip(keys, measure(case, name, config), strict=True)
+                made = measure(case, name, config, denoising=denoising())
+                new = zip(keys, made, strict=True)
                 _append(config.results, [{"key": key, **record} for key, record in new])
                 done = read(config.results)
             records += [done[key] for key in keys]
