@@ -16,13 +16,15 @@ GLASS, BOX = (DATA / f"cornell-{name}-64.exr" for name in ("glass", "box"))
 
 @pytest.mark.parametrize("method", choice.METHODS)
 def test_methods_are_local(method, glass_frame):
-    """By crops as a whole; with a pixel less around them, somewhere not."""
+    """By crops, and on a device as one of several, what they are as a whole."""
     found = choice.local(jax.random.key(0), glass_frame, "oidn", method=method)
     whole = np.asarray(found.function(found.images))
     made = np.empty_like(whole)
     for where, part in tiles.stream_crops(**found._asdict(), tile=17):
         made[where] = part
-    np.testing.assert_allclose(made, whole, rtol=1e-9, atol=1e-12)
+    shards = tiles.map_shards(**found._asdict())
+    for parts in (made, shards):
+        np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-6)
 
 
 @pytest.fixture
