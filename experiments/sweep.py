@@ -13,12 +13,10 @@ frame once, and of combining. Compilation, in the first case of a size, is the f
 call less the median.
 """
 
-import concurrent.futures
 import dataclasses
 import functools
 import hashlib
 import json
-import multiprocessing
 import pathlib
 import statistics
 import sys
@@ -35,6 +33,7 @@ from tqdm import tqdm
 import jscomb
 from experiments import frames, render
 from experiments.combiners import COMBINERS
+from experiments.timing import apart
 from jscomb import exr, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
@@ -125,7 +124,8 @@ def cases(config: Config) -> Iterator[Case]:
                 frame = frames.load(path, spp)
                 yield Case(path.stem, spp, [frame.scaled(1 / frame.exposure)], None)
             continue
-        files, seconds = _apart(_rendered, config, scene)
+        # Where Mitsuba and XLA have both compiled code, an exception may end a process.
+        files, seconds = apart(_rendered, config, scene)
         for spp, seeds in files.items():
             yield Case(scene, spp, _of_files(seeds), seconds)
 
@@ -136,16 +136,6 @@ def _of_files(paths: list[pathlib.Path]) -> list[Frame]:
     assert read[0].reference is not None
     unit = jnp.median(read[0].reference.image)
     return [frame.scaled(1 / unit) for frame in read]
-
-
-def _apart(function: Callable, *arguments: Any) -> Any:
-    """The function's result from a process of its own.
-
-    Where Mitsuba and XLA have both compiled code, an exception may end the process.
-    """
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 def _rendered(

@@ -1,8 +1,11 @@
-"""Median times of functions that take turns, so that a busy machine is fair to all."""
+"""Fair times and memory: functions that take turns, or have a process of their own."""
 
+import concurrent.futures
+import multiprocessing
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 
@@ -25,3 +28,18 @@ def medians(functions: dict[str, Callable], repeats: int) -> dict[str, float]:
             if repeat:
                 times[name].append(time.perf_counter() - start)
     return {name: statistics.median(each) for name, each in times.items()}
+
+
+def apart(function: Callable, *arguments: Any) -> Any:
+    """A function's result from a process of its own.
+
+    Args:
+        function: of a module.
+        arguments: its arguments, such as can be pickled.
+
+    Returns:
+        what it returns; what it raises is raised here.
+    """
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
