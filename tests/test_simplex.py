@@ -287,3 +287,25 @@ def test_bad_input():
         simplex.quadratic(jnp.ones((3, 2, 4)))
     with pytest.raises(ValueError, match="needs float64, got float32"):
         simplex.reference(*(i.astype(jnp.float32) for i in (a, a, t, t)))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_problems_that_are_not_finite_say_nothing(bad):
+    """Equal weights there, and nothing else is touched; gradients too."""
+    a, b = jnp.asarray(RNG.normal(size=(2, 3, 5)))
+    target = jnp.asarray(RNG.normal(size=(2, 5)))
+    error = a - target[:1]
+    matrix = error[:, None] * error[None] + jnp.eye(3)[..., None]
+    for solve, given in (
+        (simplex.hull, (a, b, *target)),
+        (simplex.quadratic, (matrix,)),
+    ):
+        clean = solve(*given)
+        spoilt = [given[0].at[0, ..., 2].set(bad), *given[1:]]
+        w = solve(*spoilt)
+        np.testing.assert_allclose(w[:, 2], 1 / 3, rtol=1e-12)
+        others = np.array([0, 1, 3, 4])
+        np.testing.assert_array_equal(w[:, others], clean[:, others])
+        first = lambda *g, solve=solve: jnp.sum(solve(*g)[0])
+        gradients = jax.grad(first, argnums=tuple(range(len(given))))(*spoilt)
+        assert all(np.isfinite(g).all() for g in gradients)

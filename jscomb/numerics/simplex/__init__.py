@@ -17,6 +17,8 @@ itself. Notation:
 Adding a number to all elements of M changes w'Mw by that number, so it changes no
 weights, and M itself need not be semidefinite.
 
+Where some number of a problem is not finite all bases get the same weight.
+
 The exact solvers are deterministic, and differentiable: which bases take part is found
 without derivatives, then their weights are a formula. Where two choices are as good (a
 tie) the derivative is that of one of them.

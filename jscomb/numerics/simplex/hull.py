@@ -115,7 +115,7 @@ def plane(
 
     Returns:
         u_i = p_i - mean, shape [N,2,M], and c = mean - t, shape [2,M], both divided by
-        the largest coordinate of u.
+        the largest coordinate of u; 0 where some number is not finite.
 
     Raises:
         ValueError: while tracing, if there is no base or shapes differ.
@@ -135,6 +135,8 @@ def plane(
             )
     p = jnp.stack([points_a, points_b], axis=1).reshape(n, 2, -1)
     t = jnp.stack([target_b, target_a]).reshape(2, -1)
+    known = jnp.all(jnp.isfinite(p), axis=(0, 1)) & jnp.all(jnp.isfinite(t), axis=0)
+    p, t = jnp.where(known[None, None], p, 0.0), jnp.where(known[None], t, 0.0)
     u = p - p[:1]  # exactly 0 where all points are the same, unlike p - mean
     offset = jnp.mean(u, axis=0)
     u = u - offset[None]

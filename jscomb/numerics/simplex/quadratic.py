@@ -54,6 +54,7 @@ def quadratic(matrix: Matrix) -> Weights:
 
 def _least(matrix: Float[Array, "n n m"]) -> Flat:
     """The same of M problems."""
+    matrix = _known(matrix)
     objective = objective_of(matrix)
     fixed = Objective(*lax.stop_gradient(tuple(objective)))
     best = jnp.argmin(_diagonal(matrix), axis=0, keepdims=True)
@@ -138,14 +139,15 @@ def objective_of(matrix: Matrix) -> Objective:
         matrix: M, any unit, shape [N,N,...].
 
     Returns:
-        the objective of M problems, without unit.
+        the objective of M problems, without unit; where some number is not finite that
+        of equal bases.
 
     Raises:
         ValueError: while tracing, if the matrix is not square or N is 0.
     """
     _check(matrix)
     n = len(matrix)
-    m = matrix.reshape(n, n, -1)
+    m = _known(matrix.reshape(n, n, -1))
     diagonal = _diagonal(m)
     best = jnp.arange(n)[:, None] == jnp.argmin(diagonal, axis=0)[None]
     column = jnp.sum(jnp.where(best[None], m, 0.0), axis=1)  # M_ib
@@ -164,6 +166,12 @@ def objective_of(matrix: Matrix) -> Objective:
     eye = jnp.eye(n, dtype=bool)[..., None]
     k = k + others[None, None] + jnp.where(eye, ridge[:, None], 0.0)
     return Objective(k, linear, ridge, 4 * ridge)
+
+
+def _known(matrix: Float[Array, "n n m"]) -> Float[Array, "n n m"]:
+    """0 in problems where some number is not finite: all bases are equal there."""
+    known = jnp.all(jnp.isfinite(matrix), axis=(0, 1), keepdims=True)
+    return jnp.where(known, matrix, 0.0)
 
 
 def _minimum(objective: Objective, free: Free) -> tuple[Flat, Float[Array, " m"]]:

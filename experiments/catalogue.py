@@ -1,0 +1,408 @@
+"""The public functions of images, each at work on one rendering.
+
+For the tests, which hold all of them to the same promises, and for the table of what
+each costs.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+
+from jscomb import (
+    choice,
+    double_shrinkage,
+    ensemble,
+    james_stein,
+    progressive,
+    uncorrelated,
+)
+from jscomb.denoisers import (
+    bilateral,
+    kernel_predicting,
+    nfor,
+    nonlocal_means,
+    oidn,
+    rdfc,
+    smoothing,
+)
+from jscomb.features import select, stack
+from jscomb.frame import Frame
+from jscomb.learning import networks
+from jscomb.numerics import poisson, regression, simplex, sure
+from jscomb.numerics.weights import noise_free_weights
+from jscomb.typing import Image, Scalar, Variance
+
+SAMPLES = 8  # in each sub-average
+BLOCK = 4  # pixels that a U-Net pools to one
+# Two convolutions of 3x3 on each way through levels of pixels, pairs and blocks.
+U_NET = 2 * (2 * 1 + 2 * 2) + 2 * BLOCK + BLOCK - 1
+
+
+class Rendering(NamedTuple):
+    """What the functions are given.
+
+    Attributes:
+        unbiased_a: x of half a, radiance, [H,W,3].
+        unbiased_b: of half b.
+        biased_a: y of half a, likewise.
+        biased_b: of half b.
+        variance: of the mean x of both halves, squared radiance, likewise.
+        features: of a range of about one, [H,W,F].
+        unit: a radiance typical of the frame. All that depends on the whole frame is
+            made of it, so that most functions are local.
+    """
+
+    unbiased_a: Image
+    unbiased_b: Image
+    biased_a: Image
+    biased_b: Image
+    variance: Variance
+    features: Image
+    unit: Scalar
+
+    @property
+    def unbiased(self) -> Image:
+        """x, the mean of both halves."""
+        return (self.unbiased_a + self.unbiased_b) / 2
+
+    @property
+    def biased(self) -> Image:
+        """y, likewise."""
+        return (self.biased_a + self.biased_b) / 2
+
+    @property
+    def grey(self) -> Variance:
+        """The variance's mean over channels, [H,W,1]."""
+        return jnp.mean(self.variance, axis=-1, keepdims=True)
+
+    def scaled(self, scale: Scalar) -> Self:
+        """In another unit of radiance."""
+        images = [scale * image for image in self[:4]]
+        square = scale * scale * self.variance
+        return type(self)(*images, square, self.features, scale * self.unit)
+
+
+def rendering_of(frame: Frame, *, name: str = "oidn") -> Rendering:
+    """A frame's images.
+
+    Args:
+        frame: with halves, variance and a biased image with halves.
+        name: of the biased image.
+
+    Returns:
+        them; only such features as tell something.
+    """
+    a, b = frame.halves()
+    features = stack(frame)
+    features = select([features]).of(features)
+    biased = a.biased[name].full, b.biased[name].full
+    images = a.color, b.color, *biased, frame.variance, features
+    return Rendering(*images, frame.exposure)
+
+
+class Entry(NamedTuple):
+    """A public function with all that it takes from a rendering.
+
+    Attributes:
+        function: to an image, or several on the first axis, [...,H,W,C].
+        reach: pixels around a pixel that its result depends on; None for the frame.
+        degree: the power of the unit of radiance that its result is in.
+        rounding: largest difference of float32 from float64, of the brightest pixel.
+        backwards: whether gradients go through it, not only derivatives forwards.
+        multiple: what crops have to start at multiples of.
+    """
+
+    function: Callable[[Rendering], jax.Array]
+    reach: int | None = None
+    degree: int = 1
+    rounding: float = 1e-5
+    backwards: bool = True
+    multiple: int = 1
+
+
+def _at_one(function: Callable[[Rendering], Image]) -> Callable[[Rendering], Image]:
+    """At an exposure of one, where a constant counts as a squared radiance."""
+    return lambda r: r.unit * function(r.scaled(1 / r.unit))
+
+
+def _bases(r: Rendering) -> tuple[jax.Array, jax.Array]:
+    """Three biased images of each half, [3,H,W,3]: one is the unbiased image."""
+    of = lambda x, y: jnp.stack([y, smoothing.box(x, window=3), x])
+    return of(r.unbiased_a, r.biased_a), of(r.unbiased_b, r.biased_b)
+
+
+def _targets(r: Rendering) -> tuple[jax.Array, ...]:
+    """The bases of both halves, and the halves."""
+    return *_bases(r), r.unbiased_a, r.unbiased_b
+
+
+def _ensemble(r: Rendering, **options: Any) -> Image:
+    """Of the bases and their means."""
+    a, b = _bases(r)
+    albedo, normal = r.features[..., :3], r.features[..., 3:6]
+    guides = {"albedo": albedo, "normal": normal}
+    halves = a, b, r.unbiased_a, r.unbiased_b
+    return ensemble.combine((a + b) / 2, *halves, **guides, **options)
+
+
+def _by(solve: Callable[..., jax.Array]) -> Callable[[Rendering], Image]:
+    """The bases' mean with the weights of a solver of points and targets.
+
+    Where bases are nearly alike their weights are hardly determined, but the mean is.
+    """
+
+    def function(r: Rendering) -> Image:
+        a, b, *halves = _targets(r)
+        return ensemble.average((a + b) / 2, solve(a, b, *halves))
+
+    return function
+
+
+def _by_matrix(solve: Callable[[jax.Array], jax.Array]) -> Callable[..., Image]:
+    """Likewise of a matrix: the bases' errors, and as much again of their own each."""
+
+    def weights(*targets: jax.Array, unit: Scalar) -> jax.Array:
+        a, _, _, x = targets
+        errors = jnp.where(jnp.isfinite(a) & jnp.isfinite(x)[None], a - x[None], 0.0)
+        errors = errors / unit
+        own = jnp.eye(len(a), dtype=errors.dtype)[:, :, None, None, None]
+        return solve(errors[:, None] * errors[None] + own)
+
+    return lambda r: _by(functools.partial(weights, unit=r.unit))(r)
+
+
+def _two(r: Rendering) -> Image:
+    """The same of the first two bases."""
+    a, b, *halves = _targets(r)
+    a, b = a[:2], b[:2]
+    return ensemble.average((a + b) / 2, simplex.two(a, b, *halves))
+
+
+def _sub_averages(r: Rendering, count: int) -> tuple[jax.Array, jax.Array]:
+    """Independent and correlated ones."""
+    mixed = lambda a, b: [a, b, (3 * a + b) / 4, (a + 3 * b) / 4][:count]
+    return (
+        jnp.stack(mixed(r.unbiased_a, r.unbiased_b)),
+        jnp.stack(mixed(r.biased_a, r.biased_b)),
+    )
+
+
+def _uncorrelated(combine: Callable, count: int) -> Callable[[Rendering], Image]:
+    """With a gamma that does not follow single pixels."""
+
+    def function(r: Rendering) -> Image:
+        gamma = 10 / jnp.square(r.unit)
+        return combine(*_sub_averages(r, count), gamma, SAMPLES)
+
+    return function
+
+
+def _sure(r: Rendering) -> Image:
+    """Of a denoiser that averages."""
+    denoise = lambda x: smoothing.box(x, window=5)
+    key = jax.random.key(0)
+    return sure.monte_carlo_sure(key, denoise, r.unbiased, r.variance).squared_error
+
+
+def _poisson(r: Rendering) -> Image:
+    """With the gradients of the biased image."""
+    y = r.biased
+    return poisson.reconstruct(r.unbiased, jnp.diff(y, axis=1), jnp.diff(y, axis=0))
+
+
+def combiners() -> dict[str, Entry]:
+    """All functions that combine unbiased and biased images.
+
+    Returns:
+        what they are by the public function's name, and a variant's after a blank.
+    """
+    kinds = (
+        networks.JamesSteinNetwork,
+        networks.ShrinkageNetwork,
+        networks.MixingNetwork,
+    )
+    keys = jax.random.split(jax.random.key(0), len(kinds))
+    njs, dsc, pd = (n(key, size="light") for n, key in zip(kinds, keys, strict=True))
+    xyv = lambda r: (r.unbiased, r.biased, r.variance)
+    halves = lambda r: (r.unbiased_a, r.unbiased_b, r.biased_a, r.biased_b)
+    risk = lambda r: jnp.square(r.unbiased - r.biased)
+    prior = lambda r: smoothing.box(r.biased, window=3)
+    shrink = james_stein.combine
+    return {
+        "james_stein.combine": Entry(lambda r: shrink(*xyv(r)), 14),
+        "james_stein.combine whitened": Entry(
+            lambda r: shrink(*xyv(r), whiten=True), 14
+        ),
+        "james_stein.combine corrected": Entry(
+            lambda r: shrink(*xyv(r), divergence=r.variance / 4), 14
+        ),
+        "james_stein.combine_dual": Entry(
+            lambda r: james_stein.combine_dual(*halves(r), r.variance), 14
+        ),
+        "james_stein.neural_combine": Entry(
+            lambda r: james_stein.neural_combine(
+                njs, r.unbiased, *halves(r)[2:], r.variance, exposure=r.unit
+            ),
+            U_NET + 1 + 7 + 14,
+            multiple=BLOCK,
+        ),
+        "ensemble.combine": Entry(_ensemble),
+        "ensemble.combine multi-scale": Entry(
+            lambda r: _ensemble(r, solver="multi-scale", windows=(7, 11))
+        ),
+        "uncorrelated.combine": Entry(_uncorrelated(uncorrelated.combine, 2), 7),
+        "uncorrelated.combine_crosswise": Entry(
+            _uncorrelated(uncorrelated.combine_crosswise, 4), 7
+        ),
+        "uncorrelated.combine_decorrelated": Entry(
+            _uncorrelated(uncorrelated.combine_decorrelated, 4), 7
+        ),
+        "uncorrelated.combine_uniform": Entry(
+            lambda r: uncorrelated.combine_uniform(*_sub_averages(r, 2)), 7
+        ),
+        "double_shrinkage.combine": Entry(
+            lambda r: double_shrinkage.combine(
+                prior(r), *xyv(r), r.variance / 2, r.variance / 3
+            ),
+            1,
+        ),
+        "double_shrinkage.neural_combine": Entry(
+            lambda r: double_shrinkage.neural_combine(
+                dsc, prior(r), *xyv(r)[:2], r.grey, r.grey / 4, exposure=r.unit
+            ),
+            U_NET + 6 + 1,
+            multiple=BLOCK,
+        ),
+        "progressive.combine": Entry(lambda r: progressive.combine(*xyv(r), risk(r))),
+        "progressive.neural_combine": Entry(
+            lambda r: progressive.neural_combine(
+                pd, *xyv(r), risk(r), bound=False, exposure=r.unit
+            ),
+            7,
+        ),
+        **{
+            f"choice.{name}": Entry(lambda r, method=method: method(*xyv(r)), 15)
+            for name, method in choice.UNTRAINED.items()
+        },
+    }
+
+
+def denoisers(*, window: int = 51) -> dict[str, Entry]:
+    """All functions that make a biased image.
+
+    Args:
+        window: width of the regressions' windows in pixels, odd.
+
+    Returns:
+        as `combiners`.
+    """
+    network = networks.KernelPredictor(jax.random.key(0), size="light")
+    guided = lambda r: (r.unbiased, r.biased, r.variance)
+    halves = lambda r: (r.unbiased_a, r.unbiased_b)
+    seven = lambda r: r.features[..., :7]
+    far = 2 * (window // 2)  # a pixel's fits, and the fits' pixels
+    found = {
+        "bilateral.denoise": Entry(
+            lambda r: bilateral.denoise(r.unbiased, r.variance, r.features), 10 + 1
+        ),
+        "nonlocal_means.denoise": Entry(
+            lambda r: nonlocal_means.denoise(*guided(r)), 10 + 3
+        ),
+        "rdfc.denoise": Entry(lambda r: rdfc.denoise(*guided(r), r.features), 10 + 3),
+        "nfor.denoise": Entry(
+            lambda r: jnp.stack(
+                nfor.denoise(*halves(r), r.variance, r.variance, r.features, r.features)
+            )
+        ),
+        "smoothing.gaussian": Entry(lambda r: smoothing.gaussian(r.unbiased), 8),
+        "smoothing.box": Entry(lambda r: smoothing.box(r.unbiased), 3),
+        "kernel_predicting.denoise": Entry(
+            lambda r: kernel_predicting.denoise(
+                network, r.unbiased, r.variance, seven(r), exposure=r.unit
+            ),
+            U_NET + 1 + 5,
+            multiple=BLOCK,
+        ),
+        "james_stein.cross_regression": Entry(
+            _at_one(
+                lambda r: jnp.stack(
+                    james_stein.cross_regression(
+                        *r[:4], r.features, r.features, kappa=0.01, window=window
+                    )
+                )
+            ),
+            far,
+        ),
+        "double_shrinkage.radiance_prior": Entry(
+            _at_one(
+                lambda r: double_shrinkage.radiance_prior(
+                    *guided(r)[:2], r.grey, r.grey / 4, r.features, window=window
+                )
+            ),
+            far,
+        ),
+        "double_shrinkage.blend_prior": Entry(
+            _at_one(
+                lambda r: double_shrinkage.blend_prior(
+                    r.biased, r.grey, r.features, window=window
+                )
+            ),
+            far,
+        ),
+    }
+    if oidn.available():
+        found["oidn.denoise"] = Entry(
+            lambda r: oidn.denoise(r.unbiased, exposure=r.unit), backwards=False
+        )
+    return found
+
+
+def solvers(*, window: int = 51) -> dict[str, Entry]:
+    """All that solve something at each pixel, or for the frame.
+
+    Args:
+        window: width of the regressions' windows in pixels, odd.
+
+    Returns:
+        as `combiners`.
+    """
+    far = 2 * (window // 2)
+
+    def regressed(r: Rendering) -> Image:
+        prediction, weight = regression.local_linear(
+            r.unbiased, r.biased, r.features, 0.1, window=window
+        )
+        return jnp.where(weight > 0, prediction, 0.0)
+
+    def jointly(r: Rendering) -> Image:
+        weights = noise_free_weights(r.biased, r.grey, epsilon=0.01)
+        targets = [(r.unbiased_a, weights), (r.unbiased_b, weights)]
+        prediction, weight = regression.joint_local_linear(
+            targets, r.features, window=window
+        )
+        return jnp.where(weight > 0, prediction, 0.0)
+
+    return {
+        "simplex.hull": Entry(_by(simplex.hull), 1),
+        "simplex.two": Entry(_two, 1),
+        "simplex.quadratic": Entry(_by_matrix(simplex.quadratic), 1, rounding=2e-4),
+        "simplex.affine": Entry(_by_matrix(simplex.affine), 1, rounding=1e-2),
+        "simplex.iterative": Entry(
+            _by(lambda *given: simplex.iterative(jax.random.key(0), *given)),
+            rounding=1e-3,
+            backwards=False,
+        ),
+        "simplex.iterative_quadratic": Entry(
+            _by_matrix(lambda m: simplex.iterative_quadratic(jax.random.key(0), m)),
+            rounding=2e-3,
+            backwards=False,
+        ),
+        "ensemble.solve_weights": Entry(_by(ensemble.solve_weights), 1),
+        "poisson.reconstruct": Entry(_poisson),
+        "regression.local_linear": Entry(_at_one(regressed), far),
+        "regression.joint_local_linear": Entry(_at_one(jointly), far),
+        "sure.monte_carlo_sure": Entry(_sure, degree=2),
+    }

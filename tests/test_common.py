@@ -1,0 +1,289 @@
+"""What every public combiner, denoiser and solver promises, whatever its paper."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import hypothesis
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import catalogue
+from experiments.catalogue import Rendering
+from jscomb import (
+    choice,
+    double_shrinkage,
+    ensemble,
+    james_stein,
+    progressive,
+    uncorrelated,
+)
+from jscomb.denoisers import (
+    bilateral,
+    kernel_predicting,
+    nfor,
+    nonlocal_means,
+    oidn,
+    rdfc,
+    smoothing,
+)
+from jscomb.numerics import poisson, regression, simplex, sure, tiles
+
+ENTRIES = (
+    catalogue.combiners()
+    | catalogue.denoisers(window=11)
+    | catalogue.solvers(window=11)
+)
+
+
+class Compiled(NamedTuple):
+    """A function, compiled once for all tests, and once more for every other shape.
+
+    Attributes:
+        entry: of the catalogue.
+        result: the function.
+        everything: the result, and its derivatives: the gradient of its sum, or where
+            none goes through it what the result changes by as all images grow.
+    """
+
+    entry: catalogue.Entry
+    result: Callable[[Rendering], jax.Array]
+    everything: Callable[[Rendering], tuple[jax.Array, Any]]
+
+
+@functools.cache
+def compiled(name: str) -> Compiled:
+    """The entry of that name."""
+    entry = ENTRIES[name]
+
+    def total(r):
+        result = entry.function(r)
+        return jnp.sum(result), result
+
+    def everything(r):
+        if not entry.backwards:
+            return jax.jvp(entry.function, (r,), (jax.tree.map(jnp.ones_like, r),))
+        gradient, result = jax.grad(total, has_aux=True)(r)
+        return result, gradient
+
+    return Compiled(entry, jax.jit(entry.function), jax.jit(everything))
+
+
+@pytest.fixture(params=ENTRIES)
+def function(request):
+    """One of them."""
+    return compiled(request.param)
+
+
+@pytest.fixture(scope="session")
+def plain(glass_frame):
+    """A crop of a real frame with fireflies, float32."""
+    return catalogue.rendering_of(glass_frame)
+
+
+def cut(r, height, width):
+    """A crop."""
+    return Rendering(*(i[30 : 30 + height, 30 : 30 + width] for i in r[:-1]), r.unit)
+
+
+def assert_close(got, expected, rounding):
+    """Relative to the brightest pixel."""
+    largest = np.abs(expected).max()
+    np.testing.assert_allclose(got, expected, rtol=0, atol=rounding * largest)
+
+
+def assert_finite(everything):
+    for leaf in jax.tree.leaves(everything):
+        assert np.isfinite(leaf).all()
+
+
+def test_pure(function, plain):
+    """The same bits again, its arguments untouched, without another compilation."""
+    before = [np.array(i) for i in plain]
+    first, second = function.result(plain), function.result(plain)
+    np.testing.assert_array_equal(first, second)
+    for image, copy in zip(plain, before, strict=True):
+        np.testing.assert_array_equal(image, copy)
+    assert first.dtype == jnp.float32
+    programs = function.result._cache_size()
+    function.result(plain.scaled(jnp.float32(2)))
+    assert function.result._cache_size() == programs
+
+
+def test_eager_is_compiled(function, plain):
+    """On an image smaller than the windows."""
+    small = cut(plain, 4, 5)
+    eager, jitted = function.entry.function(small), function.result(small)
+    assert_close(eager, jitted, 10 * function.entry.rounding)
+
+
+def test_vmap_is_a_loop(function, plain):
+    crop = cut(plain, 16, 12)
+    batch = [crop, crop.scaled(jnp.float32(0.5)), jax.tree.map(jnp.flip, crop)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
+    mapped = jax.jit(jax.vmap(function.entry.function))(stacked)
+    for got, each in zip(mapped, batch, strict=True):
+        assert_close(got, function.result(each), 10 * function.entry.rounding)
+
+
+def test_differentiable(function, plain):
+    """And not by zeros."""
+    _, derivatives = function.everything(plain)
+    assert_finite(derivatives)
+    assert any(np.any(np.asarray(leaf) != 0) for leaf in jax.tree.leaves(derivatives))
+
+
+AT = slice(None, None, 17), slice(None, None, 13)
+
+HARD = {
+    "fireflies": lambda r: r._replace(
+        unbiased_a=r.unbiased_a.at[AT].set(1e6), variance=r.variance.at[AT].set(2.5e11)
+    ),
+    "fireflies, variance silent": lambda r: r._replace(
+        unbiased_a=r.unbiased_a.at[AT].set(1e6)
+    ),
+    "radiance of 1e-8": lambda r: r.scaled(jnp.float32(1e-8)),
+    "radiance of 1e6": lambda r: r.scaled(jnp.float32(1e6)),
+    "no variance": lambda r: r._replace(
+        unbiased_b=r.unbiased_a, variance=jnp.zeros_like(r.variance)
+    ),
+    "x equals y": lambda r: r._replace(biased_a=r.unbiased_a, biased_b=r.unbiased_b),
+    "collinear features": lambda r: r._replace(features=collinear(r.features)),
+    "black": lambda r: Rendering(*map(jnp.zeros_like, r[:-1]), r.unit),
+    "constant": lambda r: flat(r),
+}
+
+
+def collinear(features):
+    """Multiples of the first channel, and one that is zero."""
+    count = features.shape[-1]
+    return features[..., :1] * jnp.linspace(0, 1, count, dtype="float32")[None, None]
+
+
+def flat(r):
+    """All images alike and constant, so all bases identical and no feature of use."""
+    half = jnp.full_like(r.unbiased_a, 0.5)
+    return Rendering(*4 * [half], half / 5000, jnp.ones_like(r.features), r.unit)
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_finite_in_hard_cases(function, plain, case):
+    assert_finite(function.everything(HARD[case](plain)))
+
+
+spoilt = st.lists(
+    st.tuples(
+        st.sampled_from(Rendering._fields[:-1]),
+        st.tuples(st.integers(0, 63), st.integers(0, 63), st.integers(0, 2)),
+        st.sampled_from([np.nan, np.inf, 0.0, 1e-8, 1e6]),
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+def test_finite_whatever_pixels_hold(function, plain):
+    """In any image; variances are at least zero, by contract."""
+
+    @hypothesis.settings(max_examples=8, derandomize=True, deadline=None)
+    @hypothesis.given(spoilt)
+    def holds(pixels):
+        r = plain
+        for name, at, value in pixels:
+            r = r._replace(**{name: getattr(r, name).at[at].set(value)})
+        assert_finite(function.everything(r))
+
+    holds()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9)])
+def test_any_size(function, plain, size):
+    result, derivatives = function.everything(cut(plain, *size))
+    assert result.shape[-3:-1] == size
+    assert_finite((result, derivatives))
+
+
+@pytest.mark.parametrize("exponent", [-26, -10, 20])
+def test_scale_equivariant(function, plain, exponent):
+    """By powers of two, which round nothing."""
+    scale = jnp.float32(2.0**exponent)
+    got = function.result(plain.scaled(scale)) / scale**function.entry.degree
+    assert_close(got, function.result(plain), 1e-5)
+
+
+def test_a_flat_frame_stays_flat(function, plain):
+    if function.entry.degree != 1:
+        pytest.skip("its result is not a radiance")
+    # Open Image Denoise brightens and darkens by a few hundredths.
+    loose = 0.06 if not function.entry.backwards else 1e-5
+    np.testing.assert_allclose(function.result(flat(plain)), 0.5, rtol=loose)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_pixel_stays_local(function, plain, bad):
+    """Beyond its reach not a bit is changed, and all is finite."""
+    for name in Rendering._fields[:-1]:
+        image = getattr(plain, name).at[2, 3, 0].set(bad)
+        got = function.result(plain._replace(**{name: image}))
+        assert np.isfinite(got).all()
+        if function.entry.reach is not None:
+            far = np.maximum(*np.ogrid[-2:62, -3:61]) > function.entry.reach
+            assert far.any()
+            clean = function.result(plain)
+            np.testing.assert_array_equal(got[..., far, :], clean[..., far, :])
+
+
+def test_float32_is_float64(function, plain):
+    exact = jax.tree.map(lambda i: i.astype(jnp.float64), plain)
+    expected = jax.jit(function.entry.function)(exact)
+    assert_close(function.result(plain), expected, function.entry.rounding)
+
+
+def test_tiled_is_untiled(function, plain):
+    entry = function.entry
+    if entry.reach is None:
+        pytest.skip("it depends on the whole frame")
+    local = lambda images: entry.function(Rendering(*images, plain.unit))
+    made = tiles.map_crops(
+        local, plain[:-1], tile=24, halo=entry.reach, multiple=entry.multiple
+    )
+    assert_close(made, function.result(plain), entry.rounding)
+
+
+# Of what takes images there is nothing else.
+ELSEWHERE = {
+    "choice.choose": "of frames: test_choice.py",
+}
+
+
+def test_nothing_is_left_out():
+    modules = [
+        james_stein,
+        ensemble,
+        uncorrelated,
+        double_shrinkage,
+        progressive,
+        choice,
+        bilateral,
+        kernel_predicting,
+        nfor,
+        nonlocal_means,
+        oidn,
+        rdfc,
+        smoothing,
+        poisson,
+        regression,
+        simplex,
+        sure,
+    ]
+    found = set()
+    for module in modules:
+        short = module.__name__.rpartition(".")[2]
+        for name, f in inspect.getmembers(module, inspect.isfunction):
+            if f.__module__.startswith(module.__name__) and name[0] != "_":
+                found.add(f"{short}.{name}")
+    print(sorted(found - {n.split()[0] for n in ENTRIES} - ELSEWHERE.keys()))
