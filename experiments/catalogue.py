@@ -6,11 +6,12 @@ each costs.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from experiments.rendering import Rendering, bases, sub_averages
 from jscomb import (
     choice,
     double_shrinkage,
@@ -28,79 +29,15 @@ from jscomb.denoisers import (
     rdfc,
     smoothing,
 )
-from jscomb.features import select, stack
-from jscomb.frame import Frame
 from jscomb.learning import networks
 from jscomb.numerics import poisson, regression, simplex, sure
 from jscomb.numerics.weights import noise_free_weights
-from jscomb.typing import Image, Scalar, Variance
+from jscomb.typing import Image, Scalar
 
 SAMPLES = 8  # in each sub-average
 BLOCK = 4  # pixels that a U-Net pools to one
 # Two convolutions of 3x3 on each way through levels of pixels, pairs and blocks.
 U_NET = 2 * (2 * 1 + 2 * 2) + 2 * BLOCK + BLOCK - 1
-
-
-class Rendering(NamedTuple):
-    """What the functions are given.
-
-    Attributes:
-        unbiased_a: x of half a, radiance, [H,W,3].
-        unbiased_b: of half b.
-        biased_a: y of half a, likewise.
-        biased_b: of half b.
-        variance: of the mean x of both halves, squared radiance, likewise.
-        features: of a range of about one, [H,W,F].
-        unit: a radiance typical of the frame. All that depends on the whole frame is
-            made of it, so that most functions are local.
-    """
-
-    unbiased_a: Image
-    unbiased_b: Image
-    biased_a: Image
-    biased_b: Image
-    variance: Variance
-    features: Image
-    unit: Scalar
-
-    @property
-    def unbiased(self) -> Image:
-        """x, the mean of both halves."""
-        return (self.unbiased_a + self.unbiased_b) / 2
-
-    @property
-    def biased(self) -> Image:
-        """y, likewise."""
-        return (self.biased_a + self.biased_b) / 2
-
-    @property
-    def grey(self) -> Variance:
-        """The variance's mean over channels, [H,W,1]."""
-        return jnp.mean(self.variance, axis=-1, keepdims=True)
-
-    def scaled(self, scale: Scalar) -> Self:
-        """In another unit of radiance."""
-        images = [scale * image for image in self[:4]]
-        square = scale * scale * self.variance
-        return type(self)(*images, square, self.features, scale * self.unit)
-
-
-def rendering_of(frame: Frame, *, name: str = "oidn") -> Rendering:
-    """A frame's images.
-
-    Args:
-        frame: with halves, variance and a biased image with halves.
-        name: of the biased image.
-
-    Returns:
-        them; only such features as tell something.
-    """
-    a, b = frame.halves()
-    features = stack(frame)
-    features = select([features]).of(features)
-    biased = a.biased[name].full, b.biased[name].full
-    images = a.color, b.color, *biased, frame.variance, features
-    return Rendering(*images, frame.exposure)
 
 
 class Entry(NamedTuple):
@@ -128,20 +65,14 @@ def _at_one(function: Callable[[Rendering], Image]) -> Callable[[Rendering], Ima
     return lambda r: r.unit * function(r.scaled(1 / r.unit))
 
 
-def _bases(r: Rendering) -> tuple[jax.Array, jax.Array]:
-    """Three biased images of each half, [3,H,W,3]: one is the unbiased image."""
-    of = lambda x, y: jnp.stack([y, smoothing.box(x, window=3), x])
-    return of(r.unbiased_a, r.biased_a), of(r.unbiased_b, r.biased_b)
-
-
 def _targets(r: Rendering) -> tuple[jax.Array, ...]:
     """The bases of both halves, and the halves."""
-    return *_bases(r), r.unbiased_a, r.unbiased_b
+    return *bases(r), r.unbiased_a, r.unbiased_b
 
 
 def _ensemble(r: Rendering, **options: Any) -> Image:
     """Of the bases and their means."""
-    a, b = _bases(r)
+    a, b = bases(r)
     albedo, normal = r.features[..., :3], r.features[..., 3:6]
     guides = {"albedo": albedo, "normal": normal}
     halves = a, b, r.unbiased_a, r.unbiased_b
@@ -181,21 +112,12 @@ def _two(r: Rendering) -> Image:
     return ensemble.average((a + b) / 2, simplex.two(a, b, *halves))
 
 
-def _sub_averages(r: Rendering, count: int) -> tuple[jax.Array, jax.Array]:
-    """Independent and correlated ones."""
-    mixed = lambda a, b: [a, b, (3 * a + b) / 4, (a + 3 * b) / 4][:count]
-    return (
-        jnp.stack(mixed(r.unbiased_a, r.unbiased_b)),
-        jnp.stack(mixed(r.biased_a, r.biased_b)),
-    )
-
-
 def _uncorrelated(combine: Callable, count: int) -> Callable[[Rendering], Image]:
     """With a gamma that does not follow single pixels."""
 
     def function(r: Rendering) -> Image:
         gamma = 10 / jnp.square(r.unit)
-        return combine(*_sub_averages(r, count), gamma, SAMPLES)
+        return combine(*sub_averages(r, count), gamma, SAMPLES)
 
     return function
 
@@ -261,7 +183,7 @@ def combiners() -> dict[str, Entry]:
             _uncorrelated(uncorrelated.combine_decorrelated, 4), 7
         ),
         "uncorrelated.combine_uniform": Entry(
-            lambda r: uncorrelated.combine_uniform(*_sub_averages(r, 2)), 7
+            lambda r: uncorrelated.combine_uniform(*sub_averages(r, 2)), 7
         ),
         "double_shrinkage.combine": Entry(
             lambda r: double_shrinkage.combine(

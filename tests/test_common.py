@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from experiments import catalogue
-from experiments.catalogue import Rendering
+from experiments.rendering import Rendering, rendering_of
 from jscomb import (
     choice,
     double_shrinkage,
@@ -82,7 +82,7 @@ def function(request):
 @pytest.fixture(scope="session")
 def plain(glass_frame):
     """A crop of a real frame with fireflies, float32."""
-    return catalogue.rendering_of(glass_frame)
+    return rendering_of(glass_frame)
 
 
 def cut(r, height, width):
