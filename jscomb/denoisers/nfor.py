@@ -155,7 +155,7 @@ def filter_features(features_a: Features, features_b: Features) -> tuple[Image, 
         features_b: of half b, of other samples, or the same if they are free of noise.
 
     Returns:
-        both, each by non-local means with the weights of the other.
+        both, each by non-local means with the weights of the other, shape [H,W,F].
 
     Raises:
         ValueError: while tracing, if shapes differ.

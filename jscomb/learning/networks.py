@@ -5,6 +5,8 @@ the combiners divide by the frame's exposure before they call a network, so that
 comes out is the same for a scene that is ten times as bright.
 
 Sizes: "full" is the paper's, "light" has half the channels and a quarter of the work.
+Parameters are drawn from a typed key, in float32; `window` is the width in pixels, odd,
+of the kernels that a network makes.
 
 Away from the papers: radiance enters as log(1 + |.|) with its sign and variance as
 log(1 + ./0.01), since beside a firefly of 1e6 a network sees nothing else.

@@ -181,7 +181,8 @@ def draw(
         schedule: the crop's size and how far the exposure may be off.
 
     Returns:
-        inputs, reference, and the exposure that the network is to believe.
+        inputs and reference, as wide and high as the crop, and the exposure that the
+        network is to believe.
 
     Example:
         >>> x = jnp.ones((2, 1, 8, 8, 3))

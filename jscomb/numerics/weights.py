@@ -91,6 +91,9 @@ def noise_free_weights(
     Returns:
         the weights.
 
+    Raises:
+        ValueError: if the variance's shape is not [H,W,1].
+
     Example:
         >>> image = jnp.array([1.0, 3.0]).reshape(1, 2, 1)
         >>> variance = jnp.array([0.0, 1.0]).reshape(1, 2, 1)
@@ -153,6 +156,9 @@ def least_of(first: Weights, second: Weights) -> Weights:
 
     Returns:
         their minimum.
+
+    Raises:
+        ValueError: while tracing, if the sizes differ.
 
     Example:
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)

@@ -171,6 +171,9 @@ def stream_crops(
     Yields:
         where a tile lies, and the function's result there.
 
+    Raises:
+        ValueError: if a number is not positive, or the halo negative.
+
     Example:
         >>> from jscomb.numerics.windows import window_sum
         >>> sums, image = lambda image: window_sum(image, 3), np.ones((1, 5, 1))
