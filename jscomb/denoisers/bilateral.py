@@ -51,7 +51,8 @@ def denoise(
         itself if finite, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or `window` is even.
+        ValueError: while tracing, if shapes differ, `window` is even or `sigma` is not
+            positive.
 
     Example:
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
@@ -92,7 +93,7 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
         the denoised frame; its halves if they have variances.
 
     Raises:
-        ValueError: if the frame has no way to know the variance.
+        ValueError: if the frame has no way to know the variance, or `window` is even.
 
     Example:
         >>> import numpy as np

@@ -77,7 +77,8 @@ def denoise(
         other half, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or a width is even.
+        ValueError: while tracing, if shapes differ, a width is even, `stride` does not
+            fit, or a strength or the ridge is not positive.
 
     Example:
         >>> import numpy as np
@@ -207,7 +208,8 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
         denoised by itself: with four sub-buffers and variances, or eight or more.
 
     Raises:
-        ValueError: if the frame has no sub-buffers, or no way to know the variance.
+        ValueError: if the frame has no sub-buffers, or no way to know the variance, or
+            `window` is even, or `stride` does not fit it.
 
     Example:
         >>> import numpy as np

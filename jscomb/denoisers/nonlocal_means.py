@@ -61,7 +61,8 @@ def denoise(
         there the result is the image where it is finite, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or a width is even.
+        ValueError: while tracing, if shapes differ, a width is even or `strength` is
+            not positive.
 
     Example:
         >>> image = jnp.array([0.9, 1.1, 4.9, 5.1]).reshape(1, 4, 1)

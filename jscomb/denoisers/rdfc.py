@@ -53,7 +53,8 @@ def denoise(
         there the result is the image where it is finite, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or a width is even.
+        ValueError: while tracing, if shapes differ, a width is even or a strength is
+            not positive.
 
     Example:
         >>> import jax.numpy as jnp
@@ -91,7 +92,7 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
         the denoised frame; its halves if they have variances.
 
     Raises:
-        ValueError: if the frame has no way to know the variance.
+        ValueError: if the frame has no way to know the variance, or `window` is even.
 
     Example:
         >>> import numpy as np

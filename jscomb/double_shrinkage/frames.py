@@ -56,7 +56,8 @@ def combine_frame(
         the combination and what it was made of.
 
     Raises:
-        ValueError: if the frame has no such image, or no halves.
+        ValueError: if the frame has no such image, or no halves, or `window` is even,
+            or `stride` does not fit it.
 
     Example:
         >>> import numpy as np

@@ -111,7 +111,7 @@ def blend_prior(
         p, shape [H,W,C]; the blend where no window reaches.
 
     Raises:
-        ValueError: while tracing, if sizes differ, or a width or number is out of
+        ValueError: while tracing, if sizes differ, or a width or the ridge is out of
             range.
 
     Example:

@@ -118,7 +118,7 @@ def error_matrix(
     Example:
         >>> y = jnp.stack([jnp.full((4, 4, 1), value) for value in (2.1, 3.0)])
         >>> x = jnp.full((4, 4, 1), 2.0)
-        >>> matrix = error_matrix(y, y, x, x, windows=[])[..., 0, 0, 0]
+        >>> matrix = error_matrix(y, y, x, x, windows=[])[..., 0, 0, 0]  # one for all
         >>> print([f"{element:.3f}" for element in matrix.ravel()])
         ['-0.045', '-0.031', '-0.031', '0.106']
 

@@ -62,8 +62,8 @@ def combine(
     Example:
         >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
         >>> y, x = at(1.0, 4.0), at(2.0)[0]
-        >>> print(combine(y, y, y, x, x, filter=False).round(3))
-        [[[2.]]]
+        >>> print(combine(y, y, y, x, x, filter=False)[0, 0].round(3))
+        [2.]
 
     Source: ED section 4.
     """
@@ -193,7 +193,7 @@ def filter_weights(
         some input are the weights as they were.
 
     Raises:
-        ValueError: while tracing, if shapes differ.
+        ValueError: while tracing, if shapes differ or `sigma` is not positive.
 
     Example:
         >>> row = lambda *values: jnp.tile(jnp.array(values)[None, :, None], 3)

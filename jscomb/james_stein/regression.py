@@ -96,9 +96,9 @@ def cross_regression(
         >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
         >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
         >>> images = *(ramp + noise), np.full_like(ramp, 0.5), np.full_like(ramp, 0.5)
-        >>> regress = jax.jit(cross_regression, static_argnames="window")
-        >>> a, b = regress(*map(jnp.asarray, (*images, ramp, ramp)), window=9)
-        >>> for image in (images[0], images[2], a, b):
+        >>> fit = jax.jit(cross_regression, static_argnames="window")
+        >>> a, b = fit(*map(jnp.asarray, (*images, ramp, ramp)), window=9)
+        >>> for image in (images[0], images[2], a, b):  # x_a, y_a, y^_a, y^_b
         ...     print(f"{np.sqrt(np.mean((image - ramp) ** 2)):.3f}")
         0.202
         0.307
@@ -362,7 +362,8 @@ def regress(
         the new biased image, or the old one, and why.
 
     Raises:
-        ValueError: if the frame has no such image, or no halves.
+        ValueError: if the frame has no such image, or no halves, or as
+            `cross_regression`.
 
     Example:
         >>> from jscomb.frame import make_frame

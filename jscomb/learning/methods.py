@@ -312,7 +312,8 @@ def combine_frame(
         the combination, linear radiance, shape [H,W,C].
 
     Raises:
-        ValueError: if the frame lacks what the method needs.
+        ValueError: if there is no such method or biased image, or the frame lacks what
+            the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
 
     Example:
@@ -352,7 +353,8 @@ def local(
         the function and its images, for large ones by crops.
 
     Raises:
-        ValueError: if the frame lacks what the method needs.
+        ValueError: if there is no such method or biased image, or the frame lacks what
+            the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
 
     Example:

@@ -290,7 +290,7 @@ def combine_frames(
 
     Raises:
         ValueError: if the frames are not alike, have no samples, or their sub-buffers
-            cannot be put together to four.
+            cannot be put together to four, or `window` is even.
 
     Example:
         >>> import numpy as np

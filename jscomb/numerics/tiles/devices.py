@@ -49,8 +49,8 @@ def map_shards(
 
     Example:
         >>> from jscomb.numerics.windows import window_sum
-        >>> sums = lambda image: window_sum(image, 3)
-        >>> print(map_shards(sums, jnp.ones((2, 3, 1)), halo=1)[..., 0])
+        >>> sums, one = lambda image: window_sum(image, 3), jax.devices()[:1]
+        >>> print(map_shards(sums, jnp.ones((2, 3, 1)), halo=1, devices=one)[..., 0])
         [[4. 6. 4.]
          [4. 6. 4.]]
     """
