@@ -12,7 +12,7 @@ import tomllib
 import pytest
 
 import jscomb
-from docs import api
+from experiments import api
 
 # Each room may use those before it, never one after it.
 ROOMS = [

@@ -1,6 +1,6 @@
 """The API pages: what the docstrings say of every public name, put together by pdoc.
 
-    python docs/api.py FOLDER
+    python -m experiments.api FOLDER
 
 Public is what a user reaches by the front doors: the names that a package exports, and
 in a module that is imported by itself every name without underscore. A warning of pdoc
