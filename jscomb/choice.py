@@ -135,6 +135,15 @@ def combine(key: Key, frame: Frame, name: str, *, method: str) -> Image:
         ValueError: if there is no such method or biased image, or the frame lacks what
             the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> x, y = jnp.full((3, 3, 1), 3.0), jnp.ones((3, 3, 1))
+        >>> frame, key = make_frame(x, variance=y, biased={"y": y}), jax.random.key(0)
+        >>> for method in ("kept", "james-stein"):
+        ...     print(combine(key, frame, "y", method=method)[0, 0].round(3))
+        [1.]
+        [2.611]
     """
     found = local(key, frame, name, method=method)
     return found.function(found.images)
@@ -159,6 +168,16 @@ def local(key: Key, frame: Frame, name: str, *, method: str) -> Local:
         ValueError: if there is no such method or biased image, or the frame lacks what
             the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> from jscomb.numerics import tiles
+        >>> x, y = jnp.full((3, 3, 1), 3.0), jnp.ones((3, 3, 1))
+        >>> frame = make_frame(x, variance=y, biased={"y": y})
+        >>> found = local(jax.random.key(0), frame, "y", method="james-stein")
+        >>> image = tiles.map_crops(**found._asdict(), tile=2)
+        >>> print(found.halo, image[0, 0].round(3))
+        14 [2.611]
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")

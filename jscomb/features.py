@@ -50,6 +50,13 @@ def stack(frame: Frame) -> Image:
         the channels of those it has, in this order, shape [H,W,F], F at most 8. Depth
         is divided by its largest finite value. F is 0 for a frame without features.
 
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one, depth = jnp.ones((1, 2, 1)), jnp.array([2.0, 4.0]).reshape(1, 2, 1)
+        >>> print(stack(make_frame(one, depth=depth, visibility=one))[0])
+        [[0.5 1. ]
+         [1.  1. ]]
+
     Source: NJS, section 4 (features of the regression).
     """
     albedo, normal, depth, visibility = (

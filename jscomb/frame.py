@@ -105,6 +105,9 @@ class Frame(NamedTuple):
 
         From the renderer's own variances where it wrote them, else from the spread of
         the sub-buffers: unbiased, but with K-1 degrees of freedom very noisy.
+
+        Raises:
+            ValueError: if there is neither.
         """
         k = self.sub_buffers
         if self.buffers.variance is not None:

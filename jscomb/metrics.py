@@ -122,6 +122,12 @@ def rel_l2_change(
 
     Raises:
         ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> two = lambda value: jnp.full((2, 4, 4, 3), value)
+        >>> change = rel_l2_change(two(1.1), two(1.2), two(1.0))
+        >>> print(f"{change.mean:.4f}", change.helps)
+        -0.0225 True
     """
     changes = []
     for half in (0, 1):
@@ -152,6 +158,11 @@ def mean_change(
 
     Raises:
         ValueError: while tracing, if the shapes differ.
+
+    Example:
+        >>> change = mean_change(jnp.full((4, 4, 3), 0.03), jnp.ones((4, 4, 3)))
+        >>> print(f"{change.mean:.4f}")
+        0.0297
     """
     check_same_shape(square=square, baseline=baseline)
     mask = finite(square, baseline)
@@ -176,6 +187,10 @@ def rmse(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
 
     Raises:
         ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> print(f"{rmse(jnp.full((1, 1, 3), 3.0), jnp.ones((1, 1, 3))):.3f}")
+        2.000
     """
     image, reference = _pair(image, reference, mask)
     square = _mean(jnp.square(image - reference), mask)
@@ -203,6 +218,10 @@ def smape(
     Raises:
         ValueError: while tracing, if shapes differ.
 
+    Example:
+        >>> print(f"{smape(jnp.full((1, 1, 3), 3.0), jnp.ones((1, 1, 3))):.3f}")
+        0.500
+
     Source: DSC eq. 18 (epsilon 0.001).
     """
     image, reference = _pair(image, reference, mask)
@@ -226,6 +245,14 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
 
     Raises:
         ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> import jax
+        >>> stripes = jnp.tile(jnp.array([0.1, 0.4]), (8, 4))[..., None]
+        >>> for image in (stripes, jnp.full_like(stripes, 0.2)):
+        ...     print(f"{jax.jit(dssim)(image, stripes):.3f}")
+        0.000
+        0.487
 
     Source: Wang et al. 2004, "Image quality assessment".
     """
@@ -254,6 +281,11 @@ def tone_map(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     Returns:
         display values in [0, 1], same shape.
 
+    Example:
+        >>> shown = tone_map(jnp.array([0.0, 0.18, 1.0, 10.0]))
+        >>> print([f"{value:.3f}" for value in shown])
+        ['0.000', '0.553', '0.908', '1.000']
+
     Source: K. Narkowicz, "ACES filmic tone mapping curve", 2015; IEC 61966-2-1.
     """
     x = jnp.clip(image, 0, 1e6)  # above, the curve is flat and its squares overflow
@@ -278,6 +310,11 @@ def flip(image: ArrayLike, reference: ArrayLike) -> float:
         ImportError: if the evaluator is not installed.
         RuntimeError: if the evaluator fails; holds what it said.
 
+    Example:
+        >>> grey = np.full((16, 16, 3), 0.2)
+        >>> if importlib.util.find_spec("flip_evaluator"):
+        ...     assert flip(grey, grey) == 0 and flip(2 * grey, grey) > 0.1
+
     Source: Andersson et al. 2020.
     """
     return _run_flip(image, reference, "LDR")
@@ -299,6 +336,11 @@ def hdr_flip(image: ArrayLike, reference: ArrayLike) -> float:
             all black.
         ImportError: if the evaluator is not installed.
         RuntimeError: if the evaluator fails; holds what it said.
+
+    Example:
+        >>> grey = np.full((16, 16, 3), 0.2)
+        >>> if importlib.util.find_spec("flip_evaluator"):
+        ...     assert hdr_flip(grey, grey) == 0 and hdr_flip(2 * grey, grey) > 0.1
 
     Source: Andersson et al. 2021.
     """

@@ -31,6 +31,17 @@ def comparison(
 
     Raises:
         ValueError: if a frame has no reference.
+
+    Example:
+        >>> import tempfile
+        >>> import jax.numpy as jnp
+        >>> from jscomb.frame import make_frame
+        >>> grey = jnp.full((4, 4, 3), 0.2)
+        >>> frame = make_frame(grey, biased={"denoised": grey}, reference=grey)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     comparison(f"{folder}/errors.png", [(frame, {"combined": grey})])
+        ...     print(os.listdir(folder))
+        ['errors.png']
     """
     rows = []
     for frame, combined in frames:

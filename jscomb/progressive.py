@@ -81,6 +81,12 @@ def combine(
     Raises:
         ValueError: while tracing, if shapes differ.
 
+    Example:
+        >>> at = lambda value: jnp.full((3, 3, 1), value)
+        >>> z = combine(at(3.0), at(1.0), at(1.0), at(2.0), bound=False)
+        >>> print(z[0, 0])
+        [2.25]
+
     Source: PD eq. 11, 18.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
@@ -129,6 +135,13 @@ def neural_combine(
     Raises:
         ValueError: while tracing, if shapes differ.
 
+    Example:
+        >>> at = lambda value: jnp.full((3, 3, 1), value)
+        >>> network = lambda *_: jnp.stack([at(0.5), at(0.25), at(1.0)], axis=2)
+        >>> z = neural_combine(network, at(3.0), at(1.0), at(1.0), at(2.0), bound=False)
+        >>> print(z[0, 0].round(3))
+        [2.5]
+
     Source: PD eq. 11, 18, 19.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
@@ -168,6 +181,11 @@ def mixing(
 
     Raises:
         ValueError: while tracing, if shapes differ or `window` is even.
+
+    Example:
+        >>> at = lambda value: jnp.full((3, 3, 1), value)
+        >>> print(mixing(at(3.0), at(1.0), at(1.0), at(2.0))[0, 0])
+        [0.375]
 
     Source: PD eq. 9, 10, summed over windows and channels alike.
     """
@@ -209,6 +227,14 @@ def risk(
     Raises:
         ValueError: while tracing, if shapes differ.
 
+    Example:
+        >>> at = lambda value: jnp.full((1, 1, 1), value)
+        >>> for alpha in (0.0, 0.375, 1.0):  # x alone, the best mixing, y alone
+        ...     print(risk(at(alpha), at(3.0), at(1.0), at(1.0), at(2.0))[0, 0])
+        [1.]
+        [0.4375]
+        [2.]
+
     Source: PD eq. 8.
     """
     check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased)
@@ -230,6 +256,11 @@ def activation(outputs: Float[Array, "h w 3 c"]) -> Image:
     Returns:
         clip((xi_1 - xi_2) / max(xi_3, 1e-6), 0, 1), shape [H,W,C].
 
+    Example:
+        >>> outputs = jnp.array([0.5, 0.25, 1.0]).reshape(1, 1, 3, 1)
+        >>> print(activation(outputs)[0, 0])
+        [0.25]
+
     Source: PD eq. 19.
     """
     first, second, third = (outputs[:, :, k] for k in range(3))
@@ -249,6 +280,12 @@ def direct_activation(
 
     Returns:
         clip((1 + 2 e) sigmoid(xi_1) - e, 0, 1), shape [H,W,C].
+
+    Example:
+        >>> first = jnp.array([-10.0, 0.0, 10.0]).reshape(1, 3, 1, 1)
+        >>> outputs = jnp.concatenate([first, 0 * first, 0 * first], axis=2)
+        >>> print([f"{alpha:.3f}" for alpha in direct_activation(outputs).ravel()])
+        ['0.000', '0.500', '1.000']
 
     Source: PD table 4, which finds it worse; trained on our frames it is better.
     """
@@ -287,6 +324,15 @@ def bound_mixing(
 
     Raises:
         ValueError: while tracing, if shapes differ or `window` is even.
+
+    Example:
+        >>> at = lambda value: jnp.full((3, 3, 1), value)
+        >>> for variance in (1.0, 0.025, 0.015):
+        ...     alpha = jax.jit(bound_mixing)(at(0.5), at(1.0), at(2.0), at(variance))
+        ...     print(f"{alpha[1, 1, 0]:.3f}")
+        0.500
+        0.374
+        0.009
 
     Source: PD eq. 12-18. The width of the Gaussian there is absolute; here it is
     relative to the mean radiance, which is the same at an exposure of about one.

@@ -3,8 +3,17 @@
 from jaxtyping import Array, Bool, Float
 from jaxtyping import Key as _Key
 
-Image = Float[Array, "h w c"]  # linear scene-referred radiance, or a feature
-Variance = Float[Array, "h w c"]  # squared radiance, of the mean, never of one sample
-Mask = Bool[Array, "h w 1"]  # True where a pixel takes part
+Image = Float[Array, "h w c"]
+"""Linear scene-referred radiance, or a feature."""
+
+Variance = Float[Array, "h w c"]
+"""Squared radiance, of the mean, never of one sample."""
+
+Mask = Bool[Array, "h w 1"]
+"""True where a pixel takes part."""
+
 Scalar = Float[Array, ""]
-Key = _Key[Array, ""]  # typed, from jax.random.key
+"""One number."""
+
+Key = _Key[Array, ""]
+"""Typed, from `jax.random.key`."""

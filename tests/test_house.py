@@ -12,6 +12,7 @@ import tomllib
 import pytest
 
 import jscomb
+from experiments import api
 
 # Each room may use those before it, never one after it.
 ROOMS = [
@@ -54,6 +55,14 @@ FUNCTIONS = [
     and not name.startswith("_")
     and not module.__name__.startswith("jscomb.cli")  # the command's help
 ]
+
+# What the API pages show, once each.
+PUBLIC = {
+    f"{each.__module__}.{each.__qualname__}": each
+    for module in api.modules().values()
+    for each in (getattr(module, name) for name in api.names(module))
+    if getattr(each, "__module__", "").startswith("jscomb")
+}
 
 
 def room(module: str) -> int:
@@ -107,6 +116,19 @@ def test_docstring_names_every_argument(function):
     assert "Returns:" in doc or "Yields:" in doc
     for name in inspect.signature(function).parameters:
         assert f"\n    {name}: " in doc, f"{name} is not described"
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_names_are_documented(name):
+    each, doc = PUBLIC[name], inspect.getdoc(PUBLIC[name])
+    if inspect.isclass(each):
+        assert "\nAttributes:\n" in doc
+    if inspect.isfunction(each) or name.startswith("jscomb.learning.networks."):
+        assert "\nExample:\n    >>> " in doc
+    if inspect.isfunction(each) and re.search(
+        r"^ +raise ", inspect.getsource(each), re.M
+    ):
+        assert "\nRaises:\n" in doc
 
 
 @pytest.mark.parametrize(

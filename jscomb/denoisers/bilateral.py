@@ -51,7 +51,15 @@ def denoise(
         itself if finite, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or `window` is even.
+        ValueError: while tracing, if shapes differ, `window` is even or `sigma` is not
+            positive.
+
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> albedo = jnp.array([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
+        >>> found = denoise(image, jnp.full_like(image, 9.0), albedo, window=3)
+        >>> print([f"{value:.1f}" for value in found.ravel()])
+        ['2.0', '2.0', '6.0', '6.0']
     """
     check_same_shape(image=image, variance=variance)
     if features.shape[:2] != image.shape[:2]:
@@ -85,7 +93,16 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
         the denoised frame; its halves if they have variances.
 
     Raises:
-        ValueError: if the frame has no way to know the variance.
+        ValueError: if the frame has no way to know the variance, or `window` is even.
+
+    Example:
+        >>> import numpy as np
+        >>> from jscomb.frame import make_frame
+        >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
+        >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
+        >>> made = denoise_frame(frame, window=9)
+        >>> print([f"{i.std():.2f}" for i in (frame.color, made.full, made.halves)])
+        ['0.36', '0.05', '0.06']
     """
     return of_parts(
         frame,

@@ -46,6 +46,13 @@ def denoise(
     Raises:
         ValueError: while tracing, if shapes differ, or the network has another window.
 
+    Example:
+        >>> even = lambda x, v, f: Kernels(x, lambda i: jnp.ones((*i.shape[:2], 9)), 0)
+        >>> x = jnp.array([1.0, 2.0, 6.0]).reshape(1, 3, 1)
+        >>> y = denoise(even, x, 0 * x, x[..., :0], window=3)
+        >>> print([f"{value:.2f}" for value in y.ravel()])
+        ['1.50', '3.00', '4.00']
+
     Source: S. Bako et al., "Kernel-predicting convolutional networks for denoising
     Monte Carlo renderings", 2017; the division is ours.
     """

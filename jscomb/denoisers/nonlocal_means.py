@@ -61,7 +61,15 @@ def denoise(
         there the result is the image where it is finite, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or a width is even.
+        ValueError: while tracing, if shapes differ, a width is even or `strength` is
+            not positive.
+
+    Example:
+        >>> image = jnp.array([0.9, 1.1, 4.9, 5.1]).reshape(1, 4, 1)
+        >>> v = jnp.full_like(image, 0.01)
+        >>> y = denoise(image, image, v, window=5, patch=1, strength=2.0)
+        >>> print([f"{value:.2f}" for value in y.ravel()])
+        ['0.99', '1.01', '4.99', '5.01']
     """
     if image.shape[:2] != guide.shape[:2]:
         raise ValueError(f"guide has shape {guide.shape}, image has {image.shape}")
@@ -90,6 +98,15 @@ def weights(
     Raises:
         ValueError: while tracing, if shapes differ, `patch` is even or `strength` is
             not positive.
+
+    Example:
+        >>> from jscomb.numerics.weights import weighted_mean
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> guide = jnp.array([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
+        >>> alike = weights(guide, jnp.full_like(guide, 0.01), patch=1)
+        >>> mean = weighted_mean(image, alike, window=3)
+        >>> print([f"{value:.2f}" for value in mean.ravel()])
+        ['2.00', '2.00', '6.00', '6.00']
 
     Source: Rousselle et al. 2013.
     """

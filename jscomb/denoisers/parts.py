@@ -26,6 +26,13 @@ def of_parts(
 
     Returns:
         the denoised frame; its halves unless they lack something.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> frame = make_frame(jnp.stack([jnp.zeros((2, 2, 1)), jnp.ones((2, 2, 1))]))
+        >>> made = of_parts(frame, lambda part: 2 * part.color, variance=False)
+        >>> print(made.full[0, 0], made.halves[:, 0, 0, 0])
+        [1.] [0. 2.]
     """
     estimated = variance and frame.buffers.variance is None
     least = 2 * (2 if estimated else 1) * (2 if halves else 1)

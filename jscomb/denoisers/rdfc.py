@@ -53,7 +53,17 @@ def denoise(
         there the result is the image where it is finite, else 0.
 
     Raises:
-        ValueError: while tracing, if shapes differ or a width is even.
+        ValueError: while tracing, if shapes differ, a width is even or a strength is
+            not positive.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> image = jnp.array([1.0, 1.2, 1.4, 5.0]).reshape(1, 4, 1)
+        >>> depth = jnp.array([0.0, 1.0, 1.0, 1.0]).reshape(1, 4, 1)
+        >>> v = jnp.full_like(image, 0.04)
+        >>> y = denoise(image, image, v, depth, window=7, patch=1)
+        >>> print([f"{value:.2f}" for value in y.ravel()])
+        ['1.00', '1.30', '1.30', '5.00']
     """
     check_same_shape(image=image, guide=guide, variance=variance)
     if features.shape[:2] != image.shape[:2]:
@@ -82,7 +92,16 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
         the denoised frame; its halves if they have variances.
 
     Raises:
-        ValueError: if the frame has no way to know the variance.
+        ValueError: if the frame has no way to know the variance, or `window` is even.
+
+    Example:
+        >>> import numpy as np
+        >>> from jscomb.frame import make_frame
+        >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
+        >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
+        >>> made = denoise_frame(frame, window=9)
+        >>> print([f"{i.std():.2f}" for i in (frame.color, made.full, made.halves)])
+        ['0.36', '0.06', '0.09']
     """
 
     def one(part: Frame) -> Image:

@@ -56,7 +56,21 @@ def combine_frame(
         the combination and what it was made of.
 
     Raises:
-        ValueError: if the frame has no such image, or no halves.
+        ValueError: if the frame has no such image, or no halves, or `window` is even,
+            or `stride` does not fit it.
+
+    Example:
+        >>> import numpy as np
+        >>> from jscomb.frame import Biased, make_frame
+        >>> x = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
+        >>> y = jnp.full((2, 16, 16, 1), 1.2)
+        >>> frame = make_frame(x, variance=0 * x + 0.25, biased={"y": Biased(y[0], y)})
+        >>> image = combine_frame(frame, "y", window=11).image
+        >>> for made in (frame.color, y[0], image):
+        ...     print(f"{jnp.sqrt(jnp.mean((made - 1) ** 2)):.3f}")
+        0.364
+        0.200
+        0.114
 
     Source: DSC, with `confidence` and `biased_error` for its network's part, and the
     prior of the first blend.

@@ -65,6 +65,16 @@ def neural_combine(
     Raises:
         ValueError: while tracing, if shapes differ, or the network has another window.
 
+    Example:
+        >>> import jax
+        >>> at = lambda value: jnp.full((2, 2, 1), value)
+        >>> head = lambda near: jnp.ones((*near.shape[:2], 2 * 13**2))
+        >>> network = lambda *_: Filters(Kernels(at(1.0), head, 0), at(0.25))
+        >>> fast = jax.jit(neural_combine, static_argnames="network")
+        >>> images, one = (at(0.0), at(4.0), at(8.0), at(1.0), at(3.0)), jnp.array(1.0)
+        >>> print(fast(network, *images, exposure=one)[0, 0].round(3))
+        [1.25]
+
     Source: DSC section 4.3, eq. 9, 10.
     """
     check_same_shape(unbiased=unbiased, biased=biased, prior=prior)

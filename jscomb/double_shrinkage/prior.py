@@ -52,6 +52,13 @@ def radiance_prior(
         ValueError: while tracing, if sizes differ, or a width or number is out of
             range.
 
+    Example:
+        >>> depth, one = jnp.arange(25.0).reshape(5, 5, 1) / 25, jnp.ones((5, 5, 1))
+        >>> u, b = 2 * depth, 2 * depth + 0.2
+        >>> p = radiance_prior(u, b, one, one, depth, window=5, ridge=1e-6)
+        >>> print(jnp.abs(p - (u + b) / 2).max().round(3))
+        0.0
+
     Source: DSC eq. 11-17, with f_i - f_j for the printed f_j - f_i in eq. 17, and a
     mean where it prints a sum.
     """
@@ -104,8 +111,15 @@ def blend_prior(
         p, shape [H,W,C]; the blend where no window reaches.
 
     Raises:
-        ValueError: while tracing, if sizes differ, or a width or number is out of
+        ValueError: while tracing, if sizes differ, or a width or the ridge is out of
             range.
+
+    Example:
+        >>> import numpy as np
+        >>> x = jnp.asarray(np.random.default_rng(0).normal(1, 0.5, (16, 16, 1)))
+        >>> p = blend_prior(x, jnp.full_like(x, 0.25), x[..., :0], window=11)
+        >>> print(f"{jnp.std(x):.2f} {jnp.std(p):.2f}")
+        0.51 0.15
 
     Source: ours, after DSC eq. 11-17.
     """

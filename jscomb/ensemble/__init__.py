@@ -17,9 +17,9 @@ Half b is independent of y^a, so x_b stands for the truth there:
 unbiased for the error of the half's denoised images, which is what weights are found
 for. A number added to all elements changes no weights.
 
-One pixel's <M> is hardly more than noise, and its exact optimum follows the noise: it
+One pixel's `<M>` is hardly more than noise, and its exact optimum follows the noise: it
 is worse than the best base. What `combine` does with `solver="multi-scale"` is better:
-the mean of <M> over windows, each window's as far as both halves agree on how it
+the mean of `<M>` over windows, each window's as far as both halves agree on how it
 differs from the next larger window's, up to the whole frame's. With many samples
 weights are local, with few there is almost one for the frame.
 

@@ -34,6 +34,12 @@ def stack_bases(bases: Mapping[str, Biased]) -> Stacked:
 
     Raises:
         ValueError: names the base that has no halves, or another shape than the first.
+
+    Example:
+        >>> y = jnp.ones((4, 5, 3))
+        >>> stacked = stack_bases({"oidn": Biased(y, jnp.stack([y, y]))})
+        >>> print(*(images.shape for images in stacked))
+        (1, 4, 5, 3) (1, 4, 5, 3) (1, 4, 5, 3)
     """
     if not bases:
         raise ValueError("an ensemble needs at least one base, got none")

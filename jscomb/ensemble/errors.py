@@ -32,10 +32,17 @@ def mse_matrix(
         unbiased_b: x_b, likewise.
 
     Returns:
-        <M>, squared radiance, shape [N,N,H,W,C].
+        `<M>`, squared radiance, shape [N,N,H,W,C].
 
     Raises:
         ValueError: while tracing, if shapes differ or there is no base.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> y, x = at(1.0, 3.0), at(2.0)[0]
+        >>> print(mse_matrix(y, y, x, x)[..., 0, 0, 0])
+        [[ 1. -1.]
+         [-1.  1.]]
 
     Source: ED eq. 11, 12.
     """
@@ -59,6 +66,13 @@ def true_matrix(biased: Float[Array, "s n h w c"], truth: Image) -> Matrix:
 
     Returns:
         M, squared radiance, shape [N,N,H,W,C].
+
+    Example:
+        >>> noisy, biased = jnp.array([3.0, 1.0]), jnp.array([3.0, 3.0])
+        >>> y = jnp.stack([noisy, biased], axis=1).reshape(2, 2, 1, 1, 1)
+        >>> print(true_matrix(y, jnp.full((1, 1, 1), 2.0))[..., 0, 0, 0])
+        [[1. 0.]
+         [0. 1.]]
 
     Source: ED eq. 7, 15.
     """
@@ -94,12 +108,19 @@ def error_matrix(
         shared: one matrix for all channels, else one for each.
 
     Returns:
-        <M> in excess of the plain average's error and relative to the pixel's radiance,
-        without unit, shape [N,N,H,W,1], or [N,N,H,W,C] if not shared. At an invalid
-        pixel that of the pixels around it.
+        `<M>` in excess of the plain average's error and relative to the pixel's
+        radiance, without unit, shape [N,N,H,W,1], or [N,N,H,W,C] if not shared. At an
+        invalid pixel that of the pixels around it.
 
     Raises:
         ValueError: while tracing, if shapes differ, there is no base, or no scale.
+
+    Example:
+        >>> y = jnp.stack([jnp.full((4, 4, 1), value) for value in (2.1, 3.0)])
+        >>> x = jnp.full((4, 4, 1), 2.0)
+        >>> matrix = error_matrix(y, y, x, x, windows=[])[..., 0, 0, 0]  # one for all
+        >>> print([f"{element:.3f}" for element in matrix.ravel()])
+        ['-0.045', '-0.031', '-0.031', '0.106']
 
     Source: ours, from ED eq. 11, 12.
     """

@@ -57,6 +57,12 @@ def select_bases(
     Raises:
         ValueError: if shapes differ or there is no base.
 
+    Example:
+        >>> x = jnp.full((4, 4, 1), 2.0)
+        >>> y = jnp.stack([x + 1.0, x + 0.1])
+        >>> print(select_bases(y, y, x, x).kept)
+        (1,)
+
     Source: ours.
     """
     check_bases(biased_a, biased_b, unbiased_a, unbiased_b)

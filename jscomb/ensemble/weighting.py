@@ -59,6 +59,12 @@ def combine(
         ValueError: while tracing, if shapes differ, there is no base, or as
             `solve_weights`.
 
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> y, x = at(1.0, 4.0), at(2.0)[0]
+        >>> print(combine(y, y, y, x, x, filter=False)[0, 0].round(3))
+        [2.]
+
     Source: ED section 4.
     """
     halves = biased_a, biased_b, unbiased_a, unbiased_b
@@ -107,6 +113,12 @@ def solve_weights(
         ValueError: while tracing, if shapes differ, there is no base, the solver is not
             known, or lacks its key.
 
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> y, x = at(1.0, 4.0), at(2.0)[0]
+        >>> print([f"{share:.3f}" for share in solve_weights(y, y, x, x).ravel()])
+        ['0.667', '0.333']
+
     Source: ED eq. 13, 14.
     """
     check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
@@ -137,6 +149,11 @@ def one_hot(errors: Bases) -> Bases:
 
     Returns:
         1 for the base of least error, the first of equals, else 0, shape [N,H,W,C].
+
+    Example:
+        >>> errors = jnp.array([2.0, 1.0, 3.0]).reshape(3, 1, 1, 1)
+        >>> print(one_hot(errors).ravel())
+        [0. 1. 0.]
 
     Source: ED eq. 36, 37.
     """
@@ -176,7 +193,15 @@ def filter_weights(
         some input are the weights as they were.
 
     Raises:
-        ValueError: while tracing, if shapes differ.
+        ValueError: while tracing, if shapes differ or `sigma` is not positive.
+
+    Example:
+        >>> row = lambda *values: jnp.tile(jnp.array(values)[None, :, None], 3)
+        >>> w, edge = row(0.0, 0.4, 0.6, 1.0), row(0.0, 0.0, 1.0, 1.0)
+        >>> z = jnp.ones_like(w)
+        >>> found = filter_weights(w[None], z, z, albedo=edge, radius=1, sigma=100.0)
+        >>> print([f"{share:.2f}" for share in found[0, 0, :, 0]])
+        ['0.20', '0.20', '0.80', '0.80']
 
     Source: ED eq. 32-34, with the constants of section 4.2.
     """
@@ -216,6 +241,11 @@ def average(biased: Bases, weights: Bases) -> Image:
     Returns:
         the image, shape [H,W,C]; at a pixel where a base is not finite the first that
         is, else 0.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> print(average(at(1.0, 5.0), at(0.75, 0.25))[0, 0])
+        [2.]
 
     Source: ED eq. 3.
     """

@@ -66,6 +66,11 @@ def read_frame(
         FileNotFoundError: if there is nothing at `path`.
         ValueError: if the file is not a whole EXR file, or lacks channels, or its
             sample count is needed and not known; names the file and what is missing.
+
+    Example:
+        >>> frame = read_frame(bundled()["cornell-glass-64"])
+        >>> print(frame.color.shape, frame.samples, list(frame.biased))
+        (192, 192, 3) 64.0 ['oidn']
     """
     path = os.fspath(path)
     if not os.path.exists(path):
@@ -102,6 +107,10 @@ def read_image(path: str | os.PathLike) -> Array:
     Raises:
         FileNotFoundError: if there is nothing at `path`.
         ValueError: if the file is not a whole EXR file with colour.
+
+    Example:
+        >>> print(read_image(bundled()["cornell-glass-64"]).shape)
+        (192, 192, 3)
     """
     return read_frame(path, statistics=False).color
 
@@ -131,6 +140,14 @@ def write_frame(
         ValueError: if a biased image has the name of another part (a letter of a
             sub-buffer, `reference`, anything with a dot), or a value is too large for
             16 bits.
+
+    Example:
+        >>> import tempfile
+        >>> frame = make_frame(np.ones((2, 4, 4, 3), np.float32), samples=8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_frame(f"{folder}/frame.exr", frame)
+        ...     print(read_frame(f"{folder}/frame.exr").samples)
+        8.0
     """
     write_parts(os.fspath(path), own.to_parts(frame, provenance or {}, half))
 
@@ -154,6 +171,13 @@ def write_image(
     Raises:
         OSError: if the file cannot be written; nothing at `path` has changed.
         ValueError: if the shape is not [H,W,3].
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_image(f"{folder}/image.exr", np.full((2, 2, 3), 0.5))
+        ...     print(read_image(f"{folder}/image.exr")[0, 0])
+        [0.5 0.5 0.5]
     """
     array = np.asarray(image, np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
@@ -175,6 +199,14 @@ def read_provenance(path: str | os.PathLike) -> dict[str, Any]:
     Raises:
         FileNotFoundError: if there is nothing at `path`.
         ValueError: if it is not an EXR file.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = f"{folder}/image.exr"
+        ...     write_image(file, np.ones((2, 2, 3)), provenance={"window": 7})
+        ...     print(read_provenance(file))
+        {'window': 7}
     """
     parts = read_parts(os.fspath(path), header_only=True)
     return own.provenance(parts)

@@ -66,6 +66,15 @@ def neural_combine(
     Raises:
         ValueError: while tracing, if shapes differ, or the network has other kernels.
 
+    Example:
+        >>> import jax
+        >>> x, y = jnp.full((4, 4, 1), 3.0), jnp.ones((4, 4, 1))
+        >>> even = Kernels(x, lambda near: jnp.ones((*near.shape[:2], 15**2)), 0)
+        >>> network = lambda *_: Parameters(even, 0.5 * y)
+        >>> fast = jax.jit(neural_combine, static_argnames=("network", "window"))
+        >>> print(fast(network, x, y, y, y, window=3)[0, 0].round(3))
+        [2.674]
+
     Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.
     """
     check_same_shape(

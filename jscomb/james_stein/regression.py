@@ -92,6 +92,19 @@ def cross_regression(
     Raises:
         ValueError: while tracing, if shapes differ, or as `local_linear`.
 
+    Example:
+        >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
+        >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
+        >>> images = *(ramp + noise), np.full_like(ramp, 0.5), np.full_like(ramp, 0.5)
+        >>> fit = jax.jit(cross_regression, static_argnames="window")
+        >>> a, b = fit(*map(jnp.asarray, (*images, ramp, ramp)), window=9)
+        >>> for image in (images[0], images[2], a, b):  # x_a, y_a, y^_a, y^_b
+        ...     print(f"{np.sqrt(np.mean((image - ramp) ** 2)):.3f}")
+        0.202
+        0.307
+        0.027
+        0.022
+
     Source: NJS eq. 10-12.
     """
     check_same_shape(
@@ -187,6 +200,11 @@ def guide_noise(biased_a: Image, biased_b: Image, *, robust: bool = True) -> Sca
     Raises:
         ValueError: while tracing, if the shapes differ.
 
+    Example:
+        >>> a, b = jnp.full((2, 2, 3), 1.0), jnp.full((2, 2, 3), 1.2)
+        >>> print(f"{guide_noise(a, b):.3f}")
+        0.060
+
     Source: NJS eq. 11, the text below it.
     """
     check_same_shape(biased_a=biased_a, biased_b=biased_b)
@@ -253,6 +271,16 @@ def worth_regressing(
 
     Raises:
         ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
+        >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
+        >>> flat, v = np.full_like(ramp, 0.5), np.full_like(ramp, 0.04)
+        >>> images = *(ramp + noise), flat, flat, ramp, ramp, v, v
+        >>> judge = jax.jit(worth_regressing, static_argnames="window")
+        >>> change = judge(jax.random.key(0), *map(jnp.asarray, images), window=9)
+        >>> print(f"{change.mean:.1f} {change.helps}")
+        -0.1 True
 
     Source: ours; the random image is Hutchinson's estimate of a trace.
     """
@@ -334,7 +362,19 @@ def regress(
         the new biased image, or the old one, and why.
 
     Raises:
-        ValueError: if the frame has no such image, or no halves.
+        ValueError: if the frame has no such image, or no halves, or as
+            `cross_regression`.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
+        >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
+        >>> flat = np.full_like(noise, 0.5)
+        >>> biased = {"flat": Biased(jnp.asarray(flat[0]), jnp.asarray(flat))}
+        >>> frame = make_frame(ramp + noise, depth=ramp, biased=biased)
+        >>> found = regress(jax.random.key(0), frame, "flat", window=9)
+        >>> print(f"{found.change.mean:.1f} {found.ran}")
+        -0.2 True
     """
     halves = frame.biased[name].halves if name in frame.biased else None
     if halves is None:

@@ -23,6 +23,14 @@ def save(path: pathlib.Path, tree: Any) -> pathlib.Path:
 
     Returns:
         the path.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder, "gain.safetensors")
+        ...     print(list(load_file(save(path, {"gain": np.ones(2)}))))
+        ['gain']
     """
     arrays = {name: jax.device_get(array) for name, array in _named(tree)}
     temporary = path.with_name(path.name + ".tmp")
@@ -44,6 +52,15 @@ def load(path: pathlib.Path, like: Tree) -> Tree:
     Raises:
         ValueError: if there is no such file, it is damaged, or its arrays are others
             than the tree's; names the first.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> tree = {"gain": np.array([1.0, 2.0], np.float32)}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = save(pathlib.Path(folder, "gain.safetensors"), tree)
+        ...     print(load(path, tree)["gain"])
+        [1. 2.]
     """
     try:
         arrays = load_file(path)

@@ -128,6 +128,15 @@ def exchanged(inputs: Callable[[Key, Frame, str], Inputs]) -> Callable[..., Inpu
 
     Returns:
         likewise.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> names = "unbiased", "biased", "variance", "sure"
+        >>> images = {n: jnp.full((1, 1, 1), float(i)) for i, n in enumerate(names)}
+        >>> inputs = exchanged(lambda key, frame, name: images)
+        >>> taken = inputs(jax.random.key(0), make_frame(jnp.ones((1, 1, 1))), "oidn")
+        >>> print({name: image.item() for name, image in taken.items()})
+        {'unbiased': 1.0, 'biased': 0.0, 'variance': 3.0, 'sure': 2.0}
     """
 
     def other(key: Key, frame: Frame, name: str) -> Inputs:
@@ -239,6 +248,11 @@ def shipped(name: str) -> Network:
 
     Raises:
         ValueError: if there is no such method.
+
+    Example:
+        >>> network = shipped("pd")
+        >>> print(sum(array.size for array in jax.tree.leaves(network)), "parameters")
+        33609 parameters
     """
     folder = importlib.resources.files("jscomb.learning") / "weights"
     return load(_known(name), pathlib.Path(str(folder)) / f"{name}.safetensors")
@@ -257,6 +271,12 @@ def load(method: Method, path: pathlib.Path) -> Network:
 
     Raises:
         ValueError: if a file is missing or damaged, or of another network.
+
+    Example:
+        >>> folder = str(importlib.resources.files("jscomb.learning"))
+        >>> path = pathlib.Path(folder, "weights", "njs.safetensors")
+        >>> print(type(load(METHODS["njs"], path)).__name__)
+        JamesSteinNetwork
     """
     card = path.with_suffix(".json")
     try:
@@ -292,8 +312,22 @@ def combine_frame(
         the combination, linear radiance, shape [H,W,C].
 
     Raises:
-        ValueError: if the frame lacks what the method needs.
+        ValueError: if there is no such method or biased image, or the frame lacks what
+            the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
+
+    Example:
+        >>> import numpy as np
+        >>> from jscomb.frame import make_frame
+        >>> x = np.random.default_rng(0).normal(1, 0.2, (8, 8, 3)).astype(np.float32)
+        >>> y = np.full_like(x, 1.15)
+        >>> frame = make_frame(x, variance=np.full_like(x, 0.04), biased={"y": y})
+        >>> image = combine_frame(jax.random.key(0), frame, "y", method="njs")
+        >>> for made in (x, y, image):
+        ...     print(f"{np.sqrt(np.mean((made - 1) ** 2)):.2f}")
+        0.19
+        0.15
+        0.13
     """
     found = local(key, frame, name, method=method, network=network)
     return found.function(found.images)
@@ -319,8 +353,17 @@ def local(
         the function and its images, for large ones by crops.
 
     Raises:
-        ValueError: if the frame lacks what the method needs.
+        ValueError: if there is no such method or biased image, or the frame lacks what
+            the method needs.
         ImportError: for pd, if Open Image Denoise is not installed.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((8, 8, 3), jnp.float32)
+        >>> frame = make_frame(one, variance=one, biased={"y": one})
+        >>> found = local(jax.random.key(0), frame, "y", method="njs")
+        >>> print(sorted(found.images), found.halo, found.multiple)
+        ['biased_a', 'biased_b', 'unbiased', 'variance'] 37 4
     """
     if name not in frame.biased:
         raise ValueError(f"no biased image {name!r}; there are {list(frame.biased)}")

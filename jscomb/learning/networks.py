@@ -5,6 +5,8 @@ the combiners divide by the frame's exposure before they call a network, so that
 comes out is the same for a scene that is ten times as bright.
 
 Sizes: "full" is the paper's, "light" has half the channels and a quarter of the work.
+Parameters are drawn from a typed key, in float32; `window` is the width in pixels, odd,
+of the kernels that a network makes.
 
 Away from the papers: radiance enters as log(1 + |.|) with its sign and variance as
 log(1 + ./0.01), since beside a firefly of 1e6 a network sees nothing else.
@@ -47,6 +49,10 @@ def compress(image: Array) -> Array:
     Returns:
         sign(v) log(1 + |v|), same shape.
 
+    Example:
+        >>> print(compress(jnp.array([-1.0, 0.0, 1e6])).round(2))
+        [-0.69  0.   13.82]
+
     Source: NJS eq. 14, for its loss.
     """
     return jnp.sign(image) * jnp.log1p(jnp.abs(image))
@@ -63,6 +69,12 @@ class Convolution(nnx.Module):
     Attributes:
         kernel: shape [k,k,in,out].
         bias: shape [out].
+
+    Example:
+        >>> convolution = Convolution(jax.random.key(0), 3, 5)
+        >>> image = jax.eval_shape(convolution, jnp.ones((6, 4, 3)))
+        >>> print(image.shape, convolution.reach)
+        (6, 4, 5) 1
     """
 
     def __init__(self, key: Key, inputs: int, outputs: int, *, size: int = 3):
@@ -100,6 +112,11 @@ class UNet(nnx.Module):
     Attributes:
         down: convolutions of each level on the way down.
         up: likewise on the way up, coarsest first.
+
+    Example:
+        >>> body = UNet(jax.random.key(0), 3, size="light")
+        >>> print(jax.eval_shape(body, jnp.ones((7, 5, 3))).shape)
+        (7, 5, 16)
     """
 
     def __init__(self, key: Key, inputs: int, *, size: Size = "full"):
@@ -169,6 +186,12 @@ class JamesSteinNetwork(nnx.Module):
         kernels: convolution to the weights of the variances.
         share: convolution to alpha.
 
+    Example:
+        >>> network = JamesSteinNetwork(jax.random.key(0), size="light")
+        >>> share = lambda x: network(x, x, x, x).share
+        >>> print(jax.eval_shape(share, jnp.ones((6, 4, 3))).shape)
+        (6, 4, 1)
+
     Source: NJS section 4.4.
     """
 
@@ -209,6 +232,13 @@ class ShrinkageNetwork(nnx.Module):
         body: U-Net.
         kernels: projection to two kernels.
         confidence: projection to the logarithm of eta^2.
+
+    Example:
+        >>> network = ShrinkageNetwork(jax.random.key(0), size="light")
+        >>> confidence = lambda x, v: network(x, x, x, v, v).confidence
+        >>> x, v = jnp.ones((6, 4, 3)), jnp.ones((6, 4, 1))
+        >>> print(jax.eval_shape(confidence, x, v).shape)
+        (6, 4, 1)
 
     Source: DSC section 4.3.
     """
@@ -266,6 +296,12 @@ class MixingNetwork(nnx.Module):
         blocks: two residual blocks of two convolutions.
         last: convolution to three numbers a channel.
 
+    Example:
+        >>> network = MixingNetwork(jax.random.key(0), size="light")
+        >>> x = jnp.ones((6, 4, 3))
+        >>> print(jax.eval_shape(network, x, x, x, x).shape)
+        (6, 4, 3, 3)
+
     Source: PD section 4.3, figure 6.
     """
 
@@ -312,6 +348,15 @@ class KernelPredictor(nnx.Module):
         body: U-Net.
         kernels: convolution to one softmax kernel a pixel.
 
+    Example:
+        >>> network = KernelPredictor(jax.random.key(0), window=5, size="light")
+        >>> def weights(x, features):
+        ...     kernels = network(x, x, features)
+        ...     return kernels.head(kernels.features)  # of a strip without its ends
+        >>> strip = jnp.ones((6, 4, 3)), jnp.ones((6, 4, 7))
+        >>> print(jax.eval_shape(weights, *strip).shape)
+        (4, 4, 25)
+
     Source: S. Bako et al., "Kernel-predicting convolutional networks for denoising
     Monte Carlo renderings", 2017, with a U-Net in place of its nine convolutions.
     """
@@ -350,6 +395,11 @@ class Joint(nnx.Module):
     Attributes:
         denoiser: kernel predictor.
         combiner: James-Stein network.
+
+    Example:
+        >>> network = Joint(jax.random.key(0), size="light")
+        >>> print(sum(array.size for array in jax.tree.leaves(network)), "parameters")
+        289563 parameters
 
     Source: NJS figure 15.
     """

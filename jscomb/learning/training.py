@@ -81,6 +81,11 @@ def start(network: Network, schedule: Schedule) -> State:
 
     Returns:
         the state.
+
+    Example:
+        >>> state = start({"gain": jnp.ones(())}, Schedule(steps=10))
+        >>> print(state.step, state.network["gain"])
+        0 1.0
     """
     optimiser = schedule.optimiser().init(network)
     return State(network, optimiser, jnp.zeros((), jnp.int32))
@@ -102,6 +107,16 @@ def run(
 
     Raises:
         ValueError: if the crops are larger than the frames.
+
+    Example:
+        >>> x = jnp.ones((1, 1, 4, 4, 3))
+        >>> examples = Examples({"x": x}, 2 * x[0])
+        >>> loss = lambda gain, inputs, r, _: jnp.mean((gain * inputs["x"] - r) ** 2)
+        >>> schedule = Schedule(steps=200, batch=1, crop=2, rate=0.1)
+        >>> first = start(jnp.ones(()), schedule)
+        >>> *_, (last, value) = run(loss, first, examples, schedule)
+        >>> print(f"{last.step} {last.network:.2f}")
+        200 2.00
     """
     size = examples.reference.shape[1:3]
     if schedule.crop > min(size):
@@ -141,6 +156,13 @@ def evaluate(
 
     Returns:
         the losses, shape [N].
+
+    Example:
+        >>> x = jnp.ones((2, 1, 4, 4, 3))
+        >>> examples = Examples({"x": x}, 2 * x[:, 0])
+        >>> loss = lambda gain, inputs, r, _: jnp.mean((gain * inputs["x"] - r) ** 2)
+        >>> print(evaluate(loss, jnp.array(1.5), examples))
+        [0.25 0.25]
     """
     one = jnp.ones((), examples.reference.dtype)
     first = {name: array[:, 0] for name, array in examples.inputs.items()}
@@ -159,7 +181,16 @@ def draw(
         schedule: the crop's size and how far the exposure may be off.
 
     Returns:
-        inputs, reference, and the exposure that the network is to believe.
+        inputs and reference, as wide and high as the crop, and the exposure that the
+        network is to believe.
+
+    Example:
+        >>> x = jnp.ones((2, 1, 8, 8, 3))
+        >>> examples, schedule = Examples({"x": x}, x[:, 0]), Schedule(crop=4)
+        >>> crop = jax.jit(draw, static_argnames="schedule")
+        >>> inputs, reference, _ = crop(jax.random.key(0), examples, schedule=schedule)
+        >>> print(inputs["x"].shape, reference.shape)
+        (4, 4, 3) (4, 4, 3)
     """
     which, variant, corner, turns, colours, exposure = jax.random.split(key, 6)
     frames, height, width, _ = examples.reference.shape

@@ -2,7 +2,11 @@
 
 from jscomb.numerics import bilateral as bilateral
 from jscomb.numerics import cholesky as cholesky
+from jscomb.numerics import convolution as convolution
+from jscomb.numerics import exposure as exposure
 from jscomb.numerics import guards as guards
+from jscomb.numerics import kernels as kernels
+from jscomb.numerics import poisson as poisson
 from jscomb.numerics import regression as regression
 from jscomb.numerics import simplex as simplex
 from jscomb.numerics import sure as sure

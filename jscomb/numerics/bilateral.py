@@ -60,6 +60,14 @@ def bilateral_mean(
 
     Raises:
         ValueError: while tracing, if `window` is even or `sigma` is not positive.
+
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> edge = jnp.array([0.0, 0.0, 9.0, 9.0]).reshape(1, 4, 1)
+        >>> none = edge[..., :0]
+        >>> mean = bilateral_mean(image, edge, none, none, window=3, sigma=100.0)
+        >>> print([f"{value:.2f}" for value in mean.ravel()])
+        ['2.00', '2.00', '6.00', '6.00']
     """
     reach = check_window(window) // 2
     if not sigma > 0:

@@ -21,6 +21,12 @@ def solve(
     Returns:
         the solutions, shape [F,C,M]; finite, also where rounding makes a pivot
         negative.
+
+    Example:
+        >>> matrix = jnp.array([[2.0, 1.0], [1.0, 2.0]])[..., None]
+        >>> right = jnp.array([3.0, 3.0]).reshape(2, 1, 1)
+        >>> print(solve(matrix, right, jnp.full((2, 1), 1e-6)).ravel().round(3))
+        [1. 1.]
     """
     f = len(matrix)
     rest = jnp.concatenate([matrix, jnp.moveaxis(right, 1, 0)])

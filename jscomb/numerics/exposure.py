@@ -41,6 +41,13 @@ def in_units(
 
     Returns:
         the unit, the images and then the squares, in it.
+
+    Example:
+        >>> at = lambda value: jnp.full((1, 1, 1), value)
+        >>> valid = jnp.ones((1, 1, 1), bool)
+        >>> found = in_units(None, valid, at(4.0), at(8.0), variance=at(16.0))
+        >>> print([i.item() for i in found])
+        [4.0, 1.0, 2.0, 1.0]
     """
     if unit is None:
         unit = exposure(jnp.where(valid, images[0], 0.0))

@@ -25,6 +25,12 @@ def check_same_shape(**images: Float[Array, "..."]) -> None:
 
     Raises:
         ValueError: while tracing; names the array that differs and both shapes.
+
+    Example:
+        >>> check_same_shape(x=jnp.zeros((2, 2, 3)), y=jnp.zeros((2, 2, 1)))
+        Traceback (most recent call last):
+            ...
+        ValueError: y has shape (2, 2, 1), x has (2, 2, 3)
     """
     (first, image), *_ = images.items()
     if image.ndim != 3 or image.size == 0:
@@ -49,6 +55,12 @@ def check_not_negative(**images: Float[Array, "..."]) -> None:
 
     Raises:
         ValueError: names the array and its least value.
+
+    Example:
+        >>> check_not_negative(variance=jnp.array([1.0, -0.5]))
+        Traceback (most recent call last):
+            ...
+        ValueError: variance must be at least zero, its least is -0.5
     """
     for name, image in images.items():
         if isinstance(image, Tracer):
@@ -84,6 +96,11 @@ def first_finite(*images: Image) -> Image:
 
     Returns:
         the image, finite everywhere, shape [H,W,C].
+
+    Example:
+        >>> y, x = jnp.array([[[1.0], [jnp.nan]]]), jnp.array([[[2.0], [2.0]]])
+        >>> print(first_finite(y, x)[0, :, 0])
+        [1. 2.]
     """
     result = jnp.zeros_like(images[0])
     for image in reversed(images):

@@ -57,6 +57,12 @@ def kernel_mean(
     Raises:
         ValueError: if `window` is even or less than one, or the weights' shape is not
             [H,W,w²].
+
+    Example:
+        >>> left = jnp.zeros((1, 3, 9)).at[..., 3].set(1.0)
+        >>> image = jnp.array([1.0, 2.0, 3.0]).reshape(1, 3, 1)
+        >>> print(kernel_mean(image, left, 3)[0, :, 0])
+        [0. 1. 2.]
     """
     h, w, _ = image.shape
     r = check_window(window) // 2
@@ -93,6 +99,13 @@ def predicted_mean(
 
     Raises:
         ValueError: if `window` is even or less than one, or there are not N w² weights.
+
+    Example:
+        >>> image = jnp.array([1.0, 2.0, 6.0]).reshape(1, 3, 1)
+        >>> even = lambda near: jnp.ones((*near.shape[:2], 9))
+        >>> (mean,) = predicted_mean(image[None], Kernels(image, even, 0), 3)
+        >>> print([f"{value:.2f}" for value in mean.ravel()])
+        ['1.50', '3.00', '4.00']
     """
     n, _, _, c = images.shape
     r = check_window(window) // 2

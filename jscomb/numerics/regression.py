@@ -161,6 +161,14 @@ def joint_local_linear(
     Raises:
         ValueError: while tracing, as `local_linear`.
 
+    Example:
+        >>> depth = jnp.arange(12.0).reshape(3, 4, 1)
+        >>> even = gaussian_weights(0 * depth, 1.0)
+        >>> both = [(3 * depth, even), (3 * depth + 2, even)]
+        >>> fit = joint_local_linear(both, depth, window=3, ridge=1e-6)
+        >>> print(jnp.abs(fit.prediction - (3 * depth + 1)).max().round(3))
+        0.0
+
     Source: DSC eq. 11-15.
     """
     grid = _grid(window, stride)

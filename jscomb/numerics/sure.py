@@ -135,6 +135,13 @@ def exact_sure(
 
     Raises:
         ValueError: as `monte_carlo_sure`.
+
+    Example:
+        >>> x = jnp.full((2, 2, 1), 3.0)
+        >>> mean = lambda image: jnp.broadcast_to(jnp.mean(image), image.shape)
+        >>> risk = exact_sure(mean, x, jnp.ones_like(x))
+        >>> print(risk.squared_error[0, 0], risk.divergence[0, 0])
+        [-0.5] [0.25]
     """
     deviation = _deviation(noisy, variance).ravel()
     denoised, push = jax.linearize(denoise, noisy)
@@ -164,6 +171,13 @@ def pooled(risk: Risk, noisy: Image, variance: Variance, *, window: int) -> Risk
 
     Raises:
         ValueError: while tracing, if shapes differ or `window` is even.
+
+    Example:
+        >>> x = jnp.zeros((1, 4, 1))
+        >>> noisy = jnp.array([4.0, -2.0, 1.0, 1.0]).reshape(1, 4, 1)
+        >>> risk = pooled(Risk(x, noisy, noisy), x, x, window=3)
+        >>> print(risk.squared_error[0, :, 0])
+        [1. 1. 0. 1.]
     """
     check_same_shape(noisy=noisy, variance=variance, denoised=risk.denoised)
     valid = finite(noisy, variance)

@@ -52,6 +52,13 @@ def gaussian_weights(
         ValueError: if the bandwidth is a number that is not positive, or its shape is
             not [H,W,1].
 
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> guide = jnp.array([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
+        >>> mean = weighted_mean(image, gaussian_weights(guide, 0.01), window=3)
+        >>> print(mean[0, :, 0])
+        [2. 2. 6. 6.]
+
     Source: NJS eq. 11 (one bandwidth), DSC eq. 12 (one a pixel).
     """
     if isinstance(bandwidth, int | float) and not bandwidth > 0:
@@ -84,6 +91,17 @@ def noise_free_weights(
     Returns:
         the weights.
 
+    Raises:
+        ValueError: if the variance's shape is not [H,W,1].
+
+    Example:
+        >>> image = jnp.array([1.0, 3.0]).reshape(1, 2, 1)
+        >>> variance = jnp.array([0.0, 1.0]).reshape(1, 2, 1)
+        >>> noisy = noise_free_weights(0 * image, variance, epsilon=1e-3)
+        >>> mean = weighted_mean(image, noisy, window=3)
+        >>> print([f"{value:.2f}" for value in mean.ravel()])  # (1 + 3 e) / (1 + e), 2
+        ['2.46', '2.00']
+
     Source: DSC eq. 17.
     """
     kernel = gaussian_weights(guide, 2 * variance + epsilon)
@@ -113,6 +131,13 @@ def feature_weights(
     Raises:
         ValueError: if `strength` or `least` is not positive.
 
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> albedo = jnp.array([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
+        >>> mean = weighted_mean(image, feature_weights(albedo), window=3)
+        >>> print([f"{value:.2f}" for value in mean.ravel()])
+        ['2.00', '2.00', '6.00', '6.00']
+
     Source: Rousselle et al. 2013, "Robust denoising using feature and color
     information", eq. 6 to 8, for features without noise.
     """
@@ -131,6 +156,15 @@ def least_of(first: Weights, second: Weights) -> Weights:
 
     Returns:
         their minimum.
+
+    Raises:
+        ValueError: while tracing, if the sizes differ.
+
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> step = lambda at: gaussian_weights(jnp.where(image > at, 1.0, 0.0), 0.01)
+        >>> print(weighted_mean(image, least_of(step(2), step(4)), window=3)[0, :, 0])
+        [1. 3. 6. 6.]
     """
     check_same_shape(first=first.image[..., :1], second=second.image[..., :1])
     split, halo = first.image.shape[-1], max(first.halo, second.halo)
@@ -165,6 +199,12 @@ def weighted_mean(
 
     Raises:
         ValueError: while tracing, if the window is even.
+
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 8.0]).reshape(1, 3, 1)
+        >>> even = gaussian_weights(0 * image, 1.0)
+        >>> print(weighted_mean(image, even, window=3)[0, :, 0])
+        [2.  4.  5.5]
     """
     valid = finite(image, weights.image)
     reach = check_window(window) // 2

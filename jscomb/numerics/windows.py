@@ -184,6 +184,12 @@ def separable_sum(
 
     Raises:
         ValueError: if the kernel's length is even.
+
+    Example:
+        >>> kernel = jnp.array([1.0, 2.0, 1.0])
+        >>> print(separable_sum(jnp.ones((2, 3, 1)), kernel)[..., 0])
+        [[ 9. 12.  9.]
+         [ 9. 12.  9.]]
     """
     kernel = jnp.asarray(kernel, image.dtype)
     r = check_window(len(kernel)) // 2
@@ -240,6 +246,12 @@ def check_window(window: int) -> int:
 
     Raises:
         ValueError: otherwise; raised while tracing.
+
+    Example:
+        >>> check_window(4)
+        Traceback (most recent call last):
+            ...
+        ValueError: window must be odd and positive, got 4
     """
     if window < 1 or window % 2 == 0:
         raise ValueError(f"window must be odd and positive, got {window}")

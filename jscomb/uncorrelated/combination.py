@@ -80,6 +80,14 @@ def combine_with(
     Raises:
         ValueError: if shapes differ or `window` is even.
 
+    Example:
+        >>> y, z = jnp.array([0.0, 1.0, 5.0]), jnp.array([3.0, 3.0, 7.0])
+        >>> two = lambda image: jnp.stack([image.reshape(1, 3, 1)] * 2)
+        >>> even = lambda first, second: jnp.full_like(first, 0.5)
+        >>> u = combine_with(even, two(y), two(z), window=3)
+        >>> print([f"{v:.3f}" for v in u.ravel()])
+        ['0.500', '0.750', '5.000']
+
     Source: IDU eq. 5, theorem 2.
     """
     pairs = make_pairs(independent, correlated)
@@ -102,6 +110,13 @@ def combine_uniform(
 
     Raises:
         ValueError: if shapes differ or `window` is even.
+
+    Example:
+        >>> y, z = jnp.array([0.0, 1.0, 5.0]), jnp.array([3.0, 3.0, 7.0])
+        >>> two = lambda image: jnp.stack([image.reshape(1, 3, 1)] * 2)
+        >>> u = combine_uniform(two(y), two(z), window=3)
+        >>> print([f"{v:.3f}" for v in u.ravel()])
+        ['0.500', '0.667', '5.000']
 
     Source: IDU section 3, k_i = k_c = 1 / (|O_c| + 1).
     """
@@ -136,6 +151,13 @@ def combine_crosswise(
     Raises:
         ValueError: if shapes differ, there are not four sub-averages, `samples` is less
             than 1 or `window` is even.
+
+    Example:
+        >>> y, z = jnp.array([0.0, 1.0, 5.0]), jnp.array([3.0, 3.0, 7.0])
+        >>> four = lambda image: jnp.stack([image.reshape(1, 3, 1)] * 4)
+        >>> u = combine_crosswise(four(y), four(z), gamma=1.0, samples=8, window=3)
+        >>> print([f"{v:.3f}" for v in u.ravel()])
+        ['1.000', '0.500', '5.000']
 
     Source: IDU section 5 (cross-weighting).
     """
@@ -175,6 +197,13 @@ def combine_decorrelated(
     Raises:
         ValueError: if shapes differ, there are not four sub-averages, `samples` is less
             than 1 or `window` is even.
+
+    Example:
+        >>> y, z = jnp.array([0.0, 1.0, 5.0]), jnp.array([3.0, 3.0, 7.0])
+        >>> four = lambda image: jnp.stack([image.reshape(1, 3, 1)] * 4)
+        >>> u = combine_decorrelated(four(y), four(z), gamma=1.0, samples=8, window=3)
+        >>> print([f"{v:.3f}" for v in u.ravel()])
+        ['1.000', '0.500', '5.000']
 
     Source: IDU section 5 (L2 reconstruction).
     """

@@ -32,6 +32,12 @@ def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
     Raises:
         ValueError: if `samples` is less than 1.
 
+    Example:
+        >>> kernel = variance_kernel(0.01, 8)
+        >>> weights = kernel(jnp.array([1.0, 1.0]), jnp.array([1.0, 4.0]))
+        >>> print([f"{w:.3f}" for w in weights])
+        ['1.000', '0.487']
+
     Source: IDU eq. 8.
     """
     check_samples(samples)

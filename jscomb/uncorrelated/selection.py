@@ -77,6 +77,15 @@ def select_gamma(
     Raises:
         ValueError: as `relative_variances`.
 
+    Example:
+        >>> import numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> y = jnp.asarray(rng.normal(1, 0.2, (4, 8, 8, 1)))
+        >>> z = y + jnp.asarray(rng.normal(0, 0.1, (4, 8, 8, 1)))
+        >>> gamma = select_gamma(y, z, 16, window=3, multiples=(2, 500))
+        >>> print(f"{gamma:.2f}")
+        2.50
+
     Source: IDU section 4.2.
     """
     variances = relative_variances(
@@ -136,6 +145,15 @@ def relative_variances(
         ValueError: if shapes differ, there are not four sub-averages, `samples` or
             `stride` is less than 1, a multiple is not whole and positive, or `window`
             is even.
+
+    Example:
+        >>> import numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> y = jnp.asarray(rng.normal(1, 0.2, (4, 8, 8, 1)))
+        >>> z = y + jnp.asarray(rng.normal(0, 0.1, (4, 8, 8, 1)))
+        >>> found = relative_variances(y, z, 16, window=3, multiples=(2, 500))
+        >>> print([f"{v:.4f}" for v in found])
+        ['0.0352', '0.0325']
 
     Source: IDU section 4.2.
     """
@@ -272,7 +290,18 @@ def combine_frames(
 
     Raises:
         ValueError: if the frames are not alike, have no samples, or their sub-buffers
-            cannot be put together to four.
+            cannot be put together to four, or `window` is even.
+
+    Example:
+        >>> import numpy as np
+        >>> from jscomb.frame import make_frame
+        >>> rng = np.random.default_rng(0)
+        >>> y = rng.normal(1, 0.2, (4, 8, 8, 1))
+        >>> z = rng.normal(1, 0.2, (4, 1, 1, 1)) + 0 * y  # noise alike everywhere
+        >>> y, z = (make_frame(images, samples=64) for images in (y, z))
+        >>> found = combine_frames(y, z, window=5)
+        >>> print(f"{y.color.std():.3f} {found.image.std():.3f}")
+        0.088 0.020
 
     Source: IDU section 4.2.
     """

@@ -46,6 +46,12 @@ def iterative(
     Raises:
         ValueError: while tracing, if there is no base or shapes differ.
 
+    Example:
+        >>> points, target = jnp.array([0.0, 4.0]), jnp.array(1.0)
+        >>> w = iterative(jax.random.key(0), points, points, target, target)
+        >>> print([f"{share:.3f}" for share in w])
+        ['0.750', '0.250']
+
     Source: ED section 4.1.2; relative where the authors' program compares with 1e-6.
     """
     u, c = plane(points_a, points_b, target_a, target_b)
@@ -80,6 +86,12 @@ def iterative_quadratic(
 
     Raises:
         ValueError: while tracing, if the matrix is not square or N is 0.
+
+    Example:
+        >>> matrix = jnp.array([[1.0, 0.0], [0.0, 3.0]])
+        >>> w = iterative_quadratic(jax.random.key(0), matrix)
+        >>> print([f"{share:.3f}" for share in w])
+        ['0.750', '0.250']
 
     Source: ED section 4.1.2, for any matrix.
     """

@@ -29,6 +29,12 @@ def reference(
     Raises:
         ValueError: while tracing, if there is no base, shapes differ or the numbers are
             not float64.
+
+    Example:
+        >>> with jax.enable_x64(True):
+        ...     points, target = jnp.array([0.0, 4.0]), jnp.array(1.0)
+        ...     print(reference(points, points, target, target).round(3))
+        [0.75 0.25]
     """
     u, c = plane(points_a, points_b, target_a, target_b)
     matrix = jnp.sum(u[:, None] * u[None], axis=2)
@@ -48,6 +54,12 @@ def reference_quadratic(matrix: Matrix) -> Weights:
     Raises:
         ValueError: while tracing, if the matrix is not square, N is 0 or the numbers
             are not float64.
+
+    Example:
+        >>> with jax.enable_x64(True):
+        ...     matrix = jnp.array([[1.0, 0.0], [0.0, 3.0]])
+        ...     print(reference_quadratic(matrix).round(3))
+        [0.75 0.25]
     """
     objective = objective_of(matrix)
     return _solve(objective.matrix, objective.linear).reshape(matrix.shape[1:])

@@ -134,6 +134,13 @@ def crops(
 
     Raises:
         ValueError: if a number is not positive, or the halo negative.
+
+    Example:
+        >>> for crop in crops((4, 9), tile=4, halo=1):
+        ...     print(crop.columns.own, "in", crop.columns.crop)
+        slice(0, 4, None) in slice(0, 6, None)
+        slice(4, 8, None) in slice(3, 9, None)
+        slice(8, 9, None) in slice(3, 9, None)
     """
     if tile < 1 or multiple < 1 or halo < 0:
         raise ValueError(f"got tile={tile}, halo={halo}, multiple={multiple}")
@@ -163,6 +170,18 @@ def stream_crops(
 
     Yields:
         where a tile lies, and the function's result there.
+
+    Raises:
+        ValueError: if a number is not positive, or the halo negative.
+
+    Example:
+        >>> from jscomb.numerics.windows import window_sum
+        >>> sums, image = lambda image: window_sum(image, 3), np.ones((1, 5, 1))
+        >>> for (_, columns), own in stream_crops(sums, image, tile=2, halo=1):
+        ...     print(columns, own[..., 0])
+        slice(0, 2, None) [[2. 3.]]
+        slice(2, 4, None) [[3. 3.]]
+        slice(4, 5, None) [[2.]]
     """
     one = jax.jit(function)
     shape = jax.tree.leaves(images)[0].shape
@@ -276,6 +295,13 @@ def tile_within(
     Raises:
         ValueError: if not even a crop with a tile as wide as its halo has room.
         RuntimeError: if the backend does not tell.
+
+    Example:
+        >>> image = jax.ShapeDtypeStruct((500, 500, 3), jnp.float32)
+        >>> double = lambda image: 2 * image  # in and out, 24 bytes a pixel
+        >>> tile = tile_within(double, image, halo=4, budget=2**20)
+        >>> print(tile, (tile + 2 * 4) ** 2 * 24 <= 2**20)
+        193 True
     """
     height, width = jax.tree.leaves(images)[0].shape[:2]
     largest = max(height, width)

@@ -46,6 +46,13 @@ def map_shards(
     Raises:
         ValueError: if there are so many devices that one has fewer rows than it has to
             tell its neighbours.
+
+    Example:
+        >>> from jscomb.numerics.windows import window_sum
+        >>> sums, one = lambda image: window_sum(image, 3), jax.devices()[:1]
+        >>> print(map_shards(sums, jnp.ones((2, 3, 1)), halo=1, devices=one)[..., 0])
+        [[4. 6. 4.]
+         [4. 6. 4.]]
     """
     mesh = Mesh(np.array(jax.devices() if devices is None else devices), (_AXIS,))
     count = mesh.size

@@ -111,6 +111,15 @@ def sum_over_tiles(
 
     Returns:
         at each pixel the sum over the tiles that contain it, [C,H,W].
+
+    Example:
+        >>> plane = Region(jnp.ones((1, 4, 4)), 1)
+        >>> grid = Grid(side=2, stride=1, reach=1, batch=1)
+        >>> print(sum_over_tiles(jnp.ones_like, [plane], grid)[0])
+        [[1. 2. 2. 1.]
+         [2. 4. 4. 2.]
+         [2. 4. 4. 2.]
+         [1. 2. 2. 1.]]
     """
     height, width = regions[0].planes.shape[1:]
     columns = grid.tiles(width)
@@ -172,6 +181,12 @@ def fold_rows(
 
     Returns:
         what the last `add_row` made.
+
+    Example:
+        >>> plane = jnp.arange(4.0).reshape(1, 4, 1)
+        >>> add = lambda total, near: total + near[0][:, :2]
+        >>> print(fold_rows(add, jnp.zeros((1, 2, 1)), [plane], 3).ravel())
+        [3. 6.]
     """
 
     @jax.checkpoint
@@ -203,6 +218,12 @@ def map_rows(
 
     Returns:
         the strips' results as one image, [H,W,C].
+
+    Example:
+        >>> image = jnp.arange(4.0).reshape(4, 1, 1)
+        >>> sums = lambda near: near[:-2] + near[1:-1] + near[2:]
+        >>> print(map_rows(sums, [(image, 1)], rows=2).ravel())
+        [1. 3. 6. 5.]
     """
     height = images[0][0].shape[0]
     rows = min(rows, height)
@@ -229,6 +250,10 @@ def flat(planes: Planes) -> Float[Array, "k n"]:
 
     Returns:
         shape [K,H*W], row by row.
+
+    Example:
+        >>> print(flat(jnp.arange(4.0).reshape(1, 2, 2)))
+        [[0. 1. 2. 3.]]
     """
     count, height, width = planes.shape
     return planes.reshape(count, height * width)
