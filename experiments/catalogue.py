@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from experiments.rendering import Rendering, bases, sub_averages
 from jscomb import (
@@ -31,6 +32,7 @@ from jscomb.denoisers import (
 )
 from jscomb.learning import networks
 from jscomb.numerics import poisson, regression, simplex, sure
+from jscomb.numerics.guards import finite, first_finite
 from jscomb.numerics.weights import noise_free_weights
 from jscomb.typing import Image, Scalar
 
@@ -44,7 +46,7 @@ class Entry(NamedTuple):
     """A public function with all that it takes from a rendering.
 
     Attributes:
-        function: to an image, or several on the first axis, [...,H,W,C].
+        function: to an image, [H,W,C]; two of halves are one of 2 C channels.
         reach: pixels around a pixel that its result depends on; None for the frame.
         degree: the power of the unit of radiance that its result is in.
         rounding: largest difference of float32 from float64, of the brightest pixel.
@@ -62,7 +64,12 @@ class Entry(NamedTuple):
 
 def _at_one(function: Callable[[Rendering], Image]) -> Callable[[Rendering], Image]:
     """At an exposure of one, where a constant counts as a squared radiance."""
-    return lambda r: r.unit * function(r.scaled(1 / r.unit))
+
+    def scaled(r: Rendering) -> Image:
+        unit = lax.stop_gradient(r.unit)
+        return unit * function(r.scaled(1 / unit))
+
+    return scaled
 
 
 def _targets(r: Rendering) -> tuple[jax.Array, ...]:
@@ -150,7 +157,8 @@ def combiners() -> dict[str, Entry]:
     njs, dsc, pd = (n(key, size="light") for n, key in zip(kinds, keys, strict=True))
     xyv = lambda r: (r.unbiased, r.biased, r.variance)
     halves = lambda r: (r.unbiased_a, r.unbiased_b, r.biased_a, r.biased_b)
-    risk = lambda r: jnp.square(r.unbiased - r.biased)
+    known = lambda r: finite(r.unbiased, r.biased)  # so that derivatives are, too
+    risk = lambda r: jnp.square(jnp.where(known(r), r.unbiased - r.biased, 0.0))
     prior = lambda r: smoothing.box(r.biased, window=3)
     shrink = james_stein.combine
     return {
@@ -171,7 +179,7 @@ def combiners() -> dict[str, Entry]:
             U_NET + 1 + 7 + 14,
             multiple=BLOCK,
         ),
-        "ensemble.combine": Entry(_ensemble),
+        "ensemble.combine": Entry(_ensemble, rounding=1e-4),
         "ensemble.combine multi-scale": Entry(
             lambda r: _ensemble(r, solver="multi-scale", windows=(7, 11))
         ),
@@ -226,6 +234,7 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
     halves = lambda r: (r.unbiased_a, r.unbiased_b)
     seven = lambda r: r.features[..., :7]
     far = 2 * (window // 2)  # a pixel's fits, and the fits' pixels
+    # Priors say by what is not finite where nothing is known.
     found = {
         "bilateral.denoise": Entry(
             lambda r: bilateral.denoise(r.unbiased, r.variance, r.features), 10 + 1
@@ -235,8 +244,11 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
         ),
         "rdfc.denoise": Entry(lambda r: rdfc.denoise(*guided(r), r.features), 10 + 3),
         "nfor.denoise": Entry(
-            lambda r: jnp.stack(
-                nfor.denoise(*halves(r), r.variance, r.variance, r.features, r.features)
+            lambda r: jnp.concatenate(
+                nfor.denoise(
+                    *halves(r), r.variance, r.variance, r.features, r.features
+                ),
+                axis=-1,
             )
         ),
         "smoothing.gaussian": Entry(lambda r: smoothing.gaussian(r.unbiased), 8),
@@ -250,26 +262,31 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
         ),
         "james_stein.cross_regression": Entry(
             _at_one(
-                lambda r: jnp.stack(
+                lambda r: jnp.concatenate(
                     james_stein.cross_regression(
                         *r[:4], r.features, r.features, kappa=0.01, window=window
-                    )
+                    ),
+                    axis=-1,
                 )
             ),
             far,
         ),
         "double_shrinkage.radiance_prior": Entry(
             _at_one(
-                lambda r: double_shrinkage.radiance_prior(
-                    *guided(r)[:2], r.grey, r.grey / 4, r.features, window=window
+                lambda r: first_finite(
+                    double_shrinkage.radiance_prior(
+                        *guided(r)[:2], r.grey, r.grey / 4, r.features, window=window
+                    )
                 )
             ),
             far,
         ),
         "double_shrinkage.blend_prior": Entry(
             _at_one(
-                lambda r: double_shrinkage.blend_prior(
-                    r.biased, r.grey, r.features, window=window
+                lambda r: first_finite(
+                    double_shrinkage.blend_prior(
+                        r.biased, r.grey, r.features, window=window
+                    )
                 )
             ),
             far,

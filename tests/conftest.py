@@ -1,5 +1,6 @@
 """Strict arithmetic for every test: no silent broadcast, promotion or key reuse."""
 
+import itertools
 import os
 import pathlib
 import sys
@@ -21,6 +22,8 @@ jax.config.update("jax_debug_key_reuse", True)
 mpl.use("agg")
 
 DATA = pathlib.Path(__file__).parent / "data"
+MAPPINGS = pathlib.Path("/proc/self/maps")
+_TESTS = itertools.count()
 
 
 _STATES: dict[str, dict] = {}
@@ -33,6 +36,18 @@ def same_numbers(request):
     if rng is not None:
         generator = rng.bit_generator
         generator.state = _STATES.setdefault(request.module.__name__, generator.state)
+
+
+@pytest.fixture(autouse=True)
+def few_programs():
+    """Give compiled programs up before the process may map no more memory.
+
+    A program takes up to hundreds of the 65530 mappings that Linux allows.
+    """
+    yield
+    seldom = next(_TESTS) % 20 == 0  # to count takes a while
+    if seldom and MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > 30_000:
+        jax.clear_caches()
 
 
 @pytest.fixture

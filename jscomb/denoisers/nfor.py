@@ -136,10 +136,12 @@ def _narrow_share(
     for n, w, x in zip(narrow, wide, truth, strict=True):
         step, gap = n - w, jnp.where(known, x - w, 0.0)
         bright = jnp.mean(jnp.square(n), axis=-1, keepdims=True)
-        least = _LEAST * jnp.mean(bright)
-        scale = jnp.where(least > 0, bright + least, 1.0)
-        along += jnp.sum(step * gap, axis=-1, keepdims=True) / scale
-        square += jnp.sum(jnp.square(step), axis=-1, keepdims=True) / scale
+        scale = bright + _LEAST * jnp.mean(bright)
+        weigh = lambda product, by=scale: divide(
+            jnp.sum(product, axis=-1, keepdims=True), by, where=by > 0
+        )
+        along += weigh(step * gap)
+        square += weigh(jnp.square(step))
     along, square = (
         window_sum(jnp.asarray(i), window, mask=known) for i in (along, square)
     )
