@@ -22,7 +22,8 @@ from jaxtyping import ArrayLike
 
 from jscomb.exr import own
 from jscomb.exr.dialects import DIALECTS, recognise
-from jscomb.exr.files import Part, read_parts, write_parts
+from jscomb.exr.dialects.images import Asked
+from jscomb.exr.files import MAX_BYTES, Part, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
 
 
@@ -48,16 +49,20 @@ def read_frame(
     samples: int | None = None,
     dialect: str | None = None,
     statistics: bool = True,
+    max_bytes: int = MAX_BYTES,
 ) -> Frame:
     """Read what a renderer wrote.
 
     Args:
-        path: an EXR file, or the directory of a Tungsten frame.
+        path: an EXR file, or the directory of a Tungsten frame. Of a frame in several
+            files, the one of its colour.
         samples: samples a pixel, for files that do not say (Mitsuba); overrides what a
             file says. Where a file holds statistics of single samples, the variance of
             the mean depends on it.
         dialect: a key of `dialects.DIALECTS`; recognised from the contents if None.
         statistics: read variances; without them a sample count is never needed.
+        max_bytes: that the pixels of each file may take in memory; a file that claims
+            more is refused before its pixels are read.
 
     Returns:
         the frame, in float32.
@@ -78,7 +83,7 @@ def read_frame(
         if name not in DIALECTS:
             known = ", ".join(DIALECTS)
             raise ValueError(f"unknown dialect {name!r}, expected one of {known}")
-        contents = DIALECTS[name](path, samples, statistics)
+        contents = DIALECTS[name](path, Asked(samples, statistics, max_bytes))
         return contents if isinstance(contents, Frame) else make_frame(**contents)
     except _MALFORMED as error:
         if path in str(error):
@@ -90,11 +95,12 @@ def read_frame(
 _MALFORMED = (ValueError, TypeError, AttributeError, KeyError, IndexError)
 
 
-def read_image(path: str | os.PathLike) -> Array:
+def read_image(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> Array:
     """Read only the colour of an EXR file of any dialect.
 
     Args:
         path: an EXR file, or the directory of a Tungsten frame.
+        max_bytes: as for `read_frame`.
 
     Returns:
         the full image, linear radiance, shape [H,W,C].
@@ -103,7 +109,7 @@ def read_image(path: str | os.PathLike) -> Array:
         FileNotFoundError: if there is nothing at `path`.
         ValueError: if the file is not a whole EXR file with colour.
     """
-    return read_frame(path, statistics=False).color
+    return read_frame(path, statistics=False, max_bytes=max_bytes).color
 
 
 def write_frame(
