@@ -11,7 +11,6 @@ whole one.
 """
 
 import importlib.resources
-import json
 import os
 import pathlib
 from typing import Any
@@ -23,7 +22,7 @@ from jaxtyping import ArrayLike
 from jscomb.exr import own
 from jscomb.exr.dialects import DIALECTS, recognise
 from jscomb.exr.dialects.images import Asked
-from jscomb.exr.files import MAX_BYTES, Part, read_parts, write_parts
+from jscomb.exr.files import MAX_BYTES, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
 
 
@@ -164,9 +163,7 @@ def write_image(
     array = np.asarray(image, np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image must have shape [H,W,3], got {array.shape}")
-    channels = {name: array[..., c] for c, name in enumerate("RGB")}
-    attributes = {own.PROVENANCE: json.dumps(provenance or {}, default=str)}
-    write_parts(os.fspath(path), [Part("", channels, attributes)])
+    write_frame(path, make_frame(array), provenance=provenance)
 
 
 def read_provenance(path: str | os.PathLike) -> dict[str, Any]:

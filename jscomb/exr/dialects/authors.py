@@ -124,8 +124,10 @@ HDR = ".hdr.exr"
 def _reference_of(name: str) -> str | None:
     """The best image of the same scene, without its extensions, if that is another."""
     scene = name.rpartition("_")[0]
-    files = glob.glob(f"{glob.escape(scene)}_*{HDR}") if scene else []
-    best = max((file.removesuffix(HDR) for file in files), key=_rank, default=name)
+    files = glob.glob(f"{glob.escape(scene)}_*{HDR}")
+    names = [file.removesuffix(HDR) for file in files]
+    same = [other for other in names if scene and other.rpartition("_")[0] == scene]
+    best = max(same, key=_rank, default=name)
     return best if _rank(best) > _rank(name) else None
 
 
@@ -138,7 +140,7 @@ def _rank(name: str) -> float:
     return float(count[1]) if count else 0.0
 
 
-def _samples(name: str, asked: Asked) -> float | None:
+def _samples(name: str, asked: Asked) -> int | float | None:
     """What was asked, else what the name says."""
     if asked.samples is not None:
         return asked.samples
