@@ -56,6 +56,8 @@ def read_parts(
     """
     if not os.path.exists(path):
         raise FileNotFoundError(f"{path}: no such file")
+    if not os.path.isfile(path):  # a pipe would be waited for
+        raise ValueError(f"{path}: is not a file")
     headers = _open(path, header_only=True).parts
     for part in headers:
         _check_header(path, part.header)

@@ -132,7 +132,7 @@ def from_parts(parts: list[Part], samples: int | None, statistics: bool) -> Fram
         ValueError: if the format is newer than this code, a checksum does not fit, or
             a part or channel is missing.
     """
-    about = _about(parts[0].attributes)
+    about = _about(parts)
     checksums, letters = about["crc32"], LETTERS[: about["sub_buffers"]]
     by_name = {part.name: part for part in parts}
     if by_name.keys() != checksums.keys():
@@ -190,7 +190,7 @@ def provenance(parts: list[Part]) -> dict[str, Any]:
     Returns:
         the provenance, empty if there is none.
     """
-    text = parts[0].attributes.get(PROVENANCE, "{}")
+    text = _first(parts).attributes.get(PROVENANCE, "{}")
     try:
         found = json.loads(text)
     except (TypeError, ValueError):
@@ -207,12 +207,18 @@ def is_own(parts: list[Part]) -> bool:
     Returns:
         True if it carries the attribute, or all else that tells.
     """
-    name, _, attributes = parts[0]
+    name, _, attributes = _first(parts)
     return ATTRIBUTE in attributes or (name == LETTERS[0] and PROVENANCE in attributes)
 
 
-def _about(attributes: dict[str, Any]) -> dict[str, Any]:
+def _first(parts: list[Part]) -> Part:
+    """The part with the attributes, wherever other programs have put it."""
+    return next((part for part in parts if ATTRIBUTE in part.attributes), parts[0])
+
+
+def _about(parts: list[Part]) -> dict[str, Any]:
     """What the attribute holds, if it is as it was written."""
+    attributes = _first(parts).attributes
     try:
         about = json.loads(attributes[ATTRIBUTE])
         version, seal = about["version"], about.pop("header crc32", None)
