@@ -115,29 +115,16 @@ def corpus(folder: pathlib.Path, *, seed: int, step: int) -> Iterator[Case]:
         the cases, kind by kind.
     """
     frame = own_frame(seed)
-    own, right = own_bytes(frame, folder), arrays(frame)
-    yield Case("as jscomb writes it", own, right)
-    yield from _damaged("jscomb's own file", own, right, step, told=True)
-    yield from _changed_parts(own, right, folder)
+    own = Case("as jscomb writes it", own_bytes(frame, folder), arrays(frame))
+    yield own
+    yield from _damaged("jscomb's own file", own, step)
+    yield from _changed_parts(own, folder)
     smooth = np.linspace(0, 1, math.prod(SIZE) * 3, dtype=np.float32)
     color = np.round(smooth, 2).reshape(*SIZE, 3)  # so that every chunk shrinks
-    plain = _of(color)
-    for codec, tolerance in CODECS.items():
-        data = _foreign(color, compression=getattr(OpenEXR, f"{codec}_COMPRESSION"))
-        yield Case("every compression", data, plain, tolerance=tolerance)
-        if codec in DAMAGED:
-            what = f"another program's file, {codec}"
-            yield from _damaged(
-                what, data, plain, step, told=codec == "ZIP", tolerance=tolerance
-            )
-    tiles = OpenEXR.TileDescription()
-    tiles.xSize = tiles.ySize = 16
-    tiled = _foreign(color, type=OpenEXR.tiledimage, tiles=tiles)
-    yield Case("tiled", tiled, plain)
-    yield from _damaged("another program's file, tiled", tiled, plain, step, told=True)
-    noise = image(seed, *SIZE, 3)
-    what = "another program's file, ZIP of noise"  # which is stored as it is
-    yield from _damaged(what, _foreign(noise), _of(noise), step, told=False)
+    for case in _whole(color, image(seed, *SIZE, 3)):
+        yield case._replace(kind="another program's file, every compression")
+        if case.kind in DAMAGED:
+            yield from _damaged("another program's file", case, step)
     yield from _unusual(color)
     black = _of(np.zeros((8, 8, 3), np.float32))
     for claim, data in assembled.claims():
@@ -160,7 +147,28 @@ CODECS = {
     "HTJ2K256": 0.0,
     "ZSTD": 0.0,
 }
-DAMAGED = ("NO", "RLE", "ZIP", "PIZ", "PXR24", "DWAA", "HTJ2K32", "ZSTD")
+HALF_CODECS = {"B44": 0.02, "B44A": 0.02, "PIZ": 0.0, "HTJ2K32": 0.0, "ZSTD": 0.0}
+DAMAGED = (
+    *("NO", "RLE", "ZIP", "ZIP of noise", "ZIP in tiles", "PIZ", "PXR24", "DWAA"),
+    *("16-bit B44", "16-bit PIZ", "HTJ2K32", "ZSTD"),
+)
+
+
+def _whole(color: np.ndarray, noise: np.ndarray) -> Iterator[Case]:
+    """Files as they should be; ZIP has a checksum, but leaves noise as it is."""
+    codec = lambda name: getattr(OpenEXR, f"{name}_COMPRESSION")
+    plain, half = _of(color), color.astype(np.float16)
+    for name, tolerance in CODECS.items():
+        data = _foreign(color, compression=codec(name))
+        yield Case(name, data, plain, name.startswith("ZIP"), tolerance)
+    for name, tolerance in HALF_CODECS.items():
+        data, right = _foreign(half, compression=codec(name)), _of(np.float32(half))
+        yield Case(f"16-bit {name}", data, right, False, tolerance)
+    yield Case("ZIP of noise", _foreign(noise), _of(noise), False)
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 16
+    tiled = _foreign(color, type=OpenEXR.tiledimage, tiles=tiles)
+    yield Case("ZIP in tiles", tiled, plain)
 
 
 def _of(color: np.ndarray) -> Arrays:
@@ -177,30 +185,26 @@ def _foreign(color: np.ndarray, **header: Any) -> bytes:
     return stream.getvalue()
 
 
-def _damaged(
-    what: str,
-    data: bytes,
-    right: Arrays,
-    step: int,
-    *,
-    told: bool,
-    tolerance: float = 0.0,
-) -> Iterator[Case]:
-    """A file cut off, and with bits flipped; only our headers have a checksum."""
+def _damaged(whose: str, case: Case, step: int) -> Iterator[Case]:
+    """A file cut off, with a bit flipped, with four bytes overwritten."""
+    data, own = case.data, "own" in whose
     for end in range(0, len(data), max(step // 2, 1)):
-        yield Case(f"{what}, truncated", data[:end], right, tolerance=tolerance)
-    start, own = header_size(data), "own" in what
-    for place in range(8, len(data), step):
-        header = place < start
-        flipped = bytearray(data)
-        flipped[place] ^= 1 << (place // step) % 8
-        yield Case(
-            f"{what}, bits flipped in the {'header' if header else 'pixels'}",
-            bytes(flipped),
-            right,
-            told and (own or not header),
-            tolerance,
-        )
+        truncated = f"{whose}, truncated"
+        yield case._replace(kind=truncated, data=data[:end], told=True)
+    codec = "" if own else f", {case.kind}"
+    random = np.random.default_rng(len(data))
+    start = header_size(data)
+    for number, place in enumerate(range(8, len(data) - 4, step)):
+        damaged = bytearray(data)
+        if number % 2:
+            damaged[place : place + 4] = random.bytes(4)
+        else:
+            damaged[place] ^= 1 << number // 2 % 8
+        if place < start:
+            kind, told = f"{whose}, header damaged", own
+        else:
+            kind, told = f"{whose}{codec}, pixels damaged", case.told
+        yield case._replace(kind=kind, data=bytes(damaged), told=told)
 
 
 def header_size(data: bytes) -> int:
@@ -230,10 +234,10 @@ def header_size(data: bytes) -> int:
     return place + 1 + 8 * chunks
 
 
-def _changed_parts(own: bytes, right: Arrays, folder: pathlib.Path) -> Iterator[Case]:
+def _changed_parts(own: Case, folder: pathlib.Path) -> Iterator[Case]:
     """Files of ours with other parts than they were written with."""
     path = folder / "parts.exr"
-    path.write_bytes(own)
+    path.write_bytes(own.data)
     parts = read_parts(str(path))
     a, b, denoised = parts
     reordered = [denoised, b, a]
@@ -250,7 +254,7 @@ def _changed_parts(own: bytes, right: Arrays, folder: pathlib.Path) -> Iterator[
     ):
         bare = [Part(p.name, p.channels, _ours(p.attributes)) for p in some]
         write_parts(str(path), bare)
-        held = right if some is reordered else None
+        held = own.right if some is reordered else None
         yield Case("parts removed, added, exchanged", path.read_bytes(), held)
 
 
@@ -262,16 +266,10 @@ def _ours(attributes: dict[str, Any]) -> dict[str, Any]:
 def _unusual(color: np.ndarray) -> Iterator[Case]:
     """Files in order that few programs write."""
     height, width = SIZE
-    half = _of(color.astype(np.float16).astype(np.float32))
     types = {"R": np.float16, "G": np.float32, "B": np.uint32}
     whole = np.round(100 * color)
     mixed = {n: whole[..., c].astype(types[n]) for c, n in enumerate("RGB")}
     yield Case("mixed types", _binding({}, mixed), _of(whole))
-    halves = {n: color[..., c].astype(np.float16) for c, n in enumerate("RGB")}
-    for codec in ("B44", "B44A", "PIZ", "ZSTD", "HTJ2K32"):
-        compression = getattr(OpenEXR, f"{codec}_COMPRESSION")
-        data = _binding({"compression": compression}, halves)
-        yield Case("16 bits", data, half, tolerance=0.02 * codec.startswith("B44"))
     bad = color.copy()
     bad[::3] = np.nan
     bad[1::5, ::2] = np.inf

@@ -102,19 +102,20 @@ def oidn(path: str, asked: Asked) -> Arguments:
     """
     name = path.removesuffix(HDR)
 
-    def image(name: str, kind: str) -> np.ndarray | None:
+    def image(kind: str) -> np.ndarray | None:
         file = f"{name}.{kind}.exr"
         return any_image(single(file, asked), "") if os.path.isfile(file) else None
 
-    found: Arguments = {"color": image(name, "hdr"), "samples": _samples(name, asked)}
-    albedo, normal = image(name, "alb"), image(name, "nrm")
+    color = rgb(single(path, asked), "")
+    found: Arguments = {"color": color, "samples": _samples(name, asked)}
+    albedo, normal = image("alb"), image("nrm")
     if albedo is not None:
         found["albedo"] = np.clip(albedo, 0, 1)
     if normal is not None:
         found["normal"] = normal
     reference = _reference_of(name)
     if reference is not None:
-        found["reference"] = image(reference, "hdr")
+        found["reference"] = rgb(single(reference, asked), "")
     return found
 
 
@@ -122,13 +123,13 @@ HDR = ".hdr.exr"
 
 
 def _reference_of(name: str) -> str | None:
-    """The best image of the same scene, without its extensions, if that is another."""
+    """The file of the best image of the same scene, if that is another."""
     scene = name.rpartition("_")[0]
     files = glob.glob(f"{glob.escape(scene)}_*{HDR}")
     names = [file.removesuffix(HDR) for file in files]
     same = [other for other in names if scene and other.rpartition("_")[0] == scene]
     best = max(same, key=_rank, default=name)
-    return best if _rank(best) > _rank(name) else None
+    return best + HDR if _rank(best) > _rank(name) else None
 
 
 def _rank(name: str) -> float:

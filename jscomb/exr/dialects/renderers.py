@@ -205,7 +205,7 @@ def blender(path: str, asked: Asked) -> Arguments:
     if normal is not None:
         found["normal"] = normal
     if depth is not None:
-        found["depth"] = np.where(depth < FAR, finite_depth(depth), 0)[..., :1]
+        found["depth"] = np.where(depth >= FAR, 0, depth)[..., :1]
     spread = image("Denoising Variance", "Denoising Image Variance")
     if asked.statistics and spread is not None:
         found["variance"] = of_the_mean(spread, samples, "the variance")
