@@ -20,6 +20,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -302,7 +303,8 @@ def _race(worker: Worker, path: pathlib.Path, config: Config) -> collections.Cou
     writers = [_worker(config), _worker(config)]
     for writer, seed in zip(writers, (OLD, NEW), strict=True):
         writer.send(write_often, str(path), seed)
-    while not all(writer.pipe.poll() for writer in writers):
+    end = time.monotonic() + config.seconds
+    while time.monotonic() < end and not all(w.pipe.poll() for w in writers):
         reply = worker.attempt(read, str(path), 2**30)
         outcomes = [verdict(str(path), reply, right, 0) for right in rights]
         found[max(outcomes, key=lambda outcome: outcome == "right image")] += 1

@@ -17,10 +17,12 @@ import OpenEXR
 
 from experiments import assembled
 from jscomb import exr
+from jscomb.exr import own
 from jscomb.exr.files import Part, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
 
 SIZE = 24, 20  # height and width in pixels
+OURS, THEIRS = "jscomb's own file", "another program's file"
 
 
 Arrays = dict[str, np.ndarray]  # of a frame, by their place in it
@@ -115,16 +117,16 @@ def corpus(folder: pathlib.Path, *, seed: int, step: int) -> Iterator[Case]:
         the cases, kind by kind.
     """
     frame = own_frame(seed)
-    own = Case("as jscomb writes it", own_bytes(frame, folder), arrays(frame))
-    yield own
-    yield from _damaged("jscomb's own file", own, step)
-    yield from _changed_parts(own, folder)
+    ours = Case("as jscomb writes it", own_bytes(frame, folder), arrays(frame))
+    yield ours
+    yield from _damaged(OURS, ours, step)
+    yield from _changed_parts(ours, folder)
     smooth = np.linspace(0, 1, math.prod(SIZE) * 3, dtype=np.float32)
     color = np.round(smooth, 2).reshape(*SIZE, 3)  # so that every chunk shrinks
     for case in _whole(color, image(seed, *SIZE, 3)):
-        yield case._replace(kind="another program's file, every compression")
+        yield case._replace(kind=f"{THEIRS}, every compression")
         if case.kind in DAMAGED:
-            yield from _damaged("another program's file", case, step)
+            yield from _damaged(THEIRS, case, step)
     yield from _unusual(color)
     black = _of(np.zeros((8, 8, 3), np.float32))
     for claim, data in assembled.claims():
@@ -179,19 +181,24 @@ def _of(color: np.ndarray) -> Arrays:
 def _foreign(color: np.ndarray, **header: Any) -> bytes:
     """An RGB file as the binding writes it."""
     channels = {n: np.ascontiguousarray(color[..., c]) for c, n in enumerate("RGB")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, **header}
+    return _written(channels, header)
+
+
+def _written(channels: dict[str, np.ndarray], header: dict[str, Any]) -> bytes:
+    """A file of any channels as the binding writes it."""
+    usual = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     stream = io.BytesIO()
-    OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, channels).write(stream)
+    OpenEXR.File(usual | header, channels).write(stream)
     return stream.getvalue()
 
 
 def _damaged(whose: str, case: Case, step: int) -> Iterator[Case]:
     """A file cut off, with a bit flipped, with four bytes overwritten."""
-    data, own = case.data, "own" in whose
+    data = case.data
     for end in range(0, len(data), max(step // 2, 1)):
         truncated = f"{whose}, truncated"
         yield case._replace(kind=truncated, data=data[:end], told=True)
-    codec = "" if own else f", {case.kind}"
+    codec = "" if whose == OURS else f", {case.kind}"
     random = np.random.default_rng(len(data))
     start = header_size(data)
     for number, place in enumerate(range(8, len(data) - 4, step)):
@@ -201,7 +208,7 @@ def _damaged(whose: str, case: Case, step: int) -> Iterator[Case]:
         else:
             damaged[place] ^= 1 << number // 2 % 8
         if place < start:
-            kind, told = f"{whose}, header damaged", own
+            kind, told = f"{whose}, header damaged", whose == OURS
         else:
             kind, told = f"{whose}{codec}, pixels damaged", case.told
         yield case._replace(kind=kind, data=bytes(damaged), told=told)
@@ -234,10 +241,10 @@ def header_size(data: bytes) -> int:
     return place + 1 + 8 * chunks
 
 
-def _changed_parts(own: Case, folder: pathlib.Path) -> Iterator[Case]:
+def _changed_parts(ours: Case, folder: pathlib.Path) -> Iterator[Case]:
     """Files of ours with other parts than they were written with."""
     path = folder / "parts.exr"
-    path.write_bytes(own.data)
+    path.write_bytes(ours.data)
     parts = read_parts(str(path))
     a, b, denoised = parts
     reordered = [denoised, b, a]
@@ -254,22 +261,22 @@ def _changed_parts(own: Case, folder: pathlib.Path) -> Iterator[Case]:
     ):
         bare = [Part(p.name, p.channels, _ours(p.attributes)) for p in some]
         write_parts(str(path), bare)
-        held = own.right if some is reordered else None
+        held = ours.right if some is reordered else None
         yield Case("parts removed, added, exchanged", path.read_bytes(), held)
 
 
 def _ours(attributes: dict[str, Any]) -> dict[str, Any]:
     """The attributes that make a file ours."""
-    return {k: v for k, v in attributes.items() if k in ("jscomb", "provenance")}
+    return {k: v for k, v in attributes.items() if k in (own.ATTRIBUTE, own.PROVENANCE)}
 
 
 def _unusual(color: np.ndarray) -> Iterator[Case]:
-    """Files in order that few programs write."""
+    """Files in order, but such as few programs write."""
     height, width = SIZE
     types = {"R": np.float16, "G": np.float32, "B": np.uint32}
     whole = np.round(100 * color)
-    mixed = {n: whole[..., c].astype(types[n]) for c, n in enumerate("RGB")}
-    yield Case("mixed types", _binding({}, mixed), _of(whole))
+    mixed = {n: whole[..., c].astype(t) for c, (n, t) in enumerate(types.items())}
+    yield Case("mixed types", _written(mixed, {}), _of(whole))
     bad = color.copy()
     bad[::3] = np.nan
     bad[1::5, ::2] = np.inf
@@ -288,11 +295,11 @@ def _unusual(color: np.ndarray) -> Iterator[Case]:
     deep = np.empty((4, 4), object)
     for place in np.ndindex(4, 4):
         deep[place] = np.ones(sum(place), np.float32)
-    header = {
+    lines = {
         "type": OpenEXR.deepscanline,
         "compression": OpenEXR.ZIPS_COMPRESSION,
     }
-    yield Case("deep", _binding(header, {n: deep for n in "RGB"}), None)
+    yield Case("deep", _written(dict.fromkeys("RGB", deep), lines), None)
     grey = image(0, 8, 8)
     made = _of(np.repeat(grey[..., None], 3, -1))
     yield Case("put together by hand", assembled.rows(grey), made)
@@ -311,11 +318,3 @@ WINDOWS = (
     (10, -2, 40, 8),
     (50, 50, 59, 54),
 )
-
-
-def _binding(header: dict[str, Any], channels: dict[str, np.ndarray]) -> bytes:
-    """A file of any channels."""
-    stream = io.BytesIO()
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, **header}
-    OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, channels).write(stream)
-    return stream.getvalue()

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import pathlib
 import signal
 import time
 
@@ -79,7 +80,7 @@ def test_the_judge_can_tell(tmp_path, read, outcome):
 
 def write_in_place(path, seed):
     """As the binding does: over the file, which is then cut off."""
-    data = hostile.own_bytes(hostile.own_frame(seed), attack.pathlib.Path(path).parent)
+    data = hostile.own_bytes(hostile.own_frame(seed), pathlib.Path(path).parent)
     with open(path, "wb") as file:
         file.write(data[:-1])
 
