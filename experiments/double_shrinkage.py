@@ -102,7 +102,8 @@ def frames(config: Config, scene: str, kept: dict) -> tuple[Frame, Frame, Image]
     """Frames of the whole and of half the time, and the latter's weighted photons."""
     if "rates" not in kept:
         kept["rates"] = rates(config, scene)
-    counts = [max(4, 4 * round(config.seconds / s / 4)) for s in kept["rates"]]
+    # The half has two buffers of two samples at least.
+    counts = [max(8, 4 * round(config.seconds / s / 4)) for s in kept["rates"]]
     whole = _whole(config, scene, *counts, reference_spp=config.reference_spp)
     half = _whole(
         config,

@@ -164,6 +164,110 @@ def test_njs_file(tmp_path):
     assert frame.depth.shape == (H, W, 1)
 
 
+def test_blender_layers(tmp_path):
+    """Cycles with denoising data, of a denoised render with the compositor's output."""
+    depth = 9 * noise(4, H, W, 1)
+    depth[0] = 1e10  # nothing there
+    rgba = lambda seed: noise(seed, H, W, 4)
+    channels = {
+        **layer("Composite.Combined", rgba(0), "RGBA"),
+        **layer("View Layer.Combined", rgba(1), "RGBA"),
+        **layer("View Layer.Noisy Image", rgba(2), "RGBA"),
+        **layer("View Layer.Denoising Albedo", 3 * noise(3, H, W, 3)),
+        **layer("View Layer.Denoising Normal", noise(5, H, W, 3), "XYZ"),
+        **layer("View Layer.Denoising Depth", depth, "Z"),
+        **layer("View Layer.Depth", noise(6, H, W, 1), "Z"),
+        **layer("View Layer.Denoising Shadowing", noise(7, H, W, 1), "X"),
+        **layer("Z second.Combined", rgba(8), "RGBA"),
+    }
+    said = {"cycles.View Layer.samples": "128", "cycles.Z second.samples": "1"}
+    frame = exr.read_frame(write(tmp_path / "b.exr", channels, **said))
+    assert frame.samples == 128
+    np.testing.assert_array_equal(frame.color, rgba(2)[..., :3])
+    np.testing.assert_array_equal(frame.biased["denoised"].full, rgba(1)[..., :3])
+    np.testing.assert_array_equal(frame.albedo, np.minimum(3 * noise(3, H, W, 3), 1))
+    np.testing.assert_array_equal(frame.normal, noise(5, H, W, 3))
+    np.testing.assert_array_equal(frame.depth[0], 0)
+    np.testing.assert_array_equal(frame.depth[1:], depth[1:])
+
+
+def test_blender_without_denoising(tmp_path):
+    color, spread = noise(0, H, W, 3), noise(1, H, W, 3)
+    channels = {
+        **layer("ViewLayer.Combined", color),
+        **layer("ViewLayer.Normal", noise(2, H, W, 3), "XYZ"),
+        **layer("ViewLayer.DiffCol", noise(3, H, W, 3)),
+        **layer("ViewLayer.Denoising Variance", spread),
+    }
+    path = write(tmp_path / "b.exr", channels)
+    with pytest.raises(ValueError, match=r"b\.exr: read as blender: .*give the sampl"):
+        exr.read_frame(path)
+    frame = exr.read_frame(path, samples=33)
+    np.testing.assert_array_equal(frame.color, color)
+    np.testing.assert_allclose(frame.variance, spread / 32, rtol=1e-6)
+    np.testing.assert_array_equal(frame.albedo, noise(3, H, W, 3))
+    np.testing.assert_array_equal(frame.normal, noise(2, H, W, 3))
+    assert not frame.biased
+
+
+def test_pd_files(tmp_path):
+    color, variance = noise(0, H, W, 3), noise(1, H, W, 3)
+    channels = {
+        **layer("", color),
+        **layer("Albedo", noise(2, H, W, 3)),
+        **layer("Normal", noise(3, H, W, 3), "XYZ"),
+        **layer("Variance", variance),
+    }
+    path = write(tmp_path / "scene_000064spp.exr", channels)
+    write(tmp_path / "scene_000064spp.den.exr", layer("", noise(4, H, W, 3)))
+    write(tmp_path / "scene_000064spp.sure.exr", layer("", noise(5, H, W, 3)))
+    frame = exr.read_frame(path)
+    assert frame.samples == 64
+    np.testing.assert_array_equal(frame.variance, variance)
+    np.testing.assert_array_equal(frame.albedo, noise(2, H, W, 3))
+    np.testing.assert_array_equal(frame.normal, noise(3, H, W, 3))
+    np.testing.assert_array_equal(frame.biased["denoised"].full, noise(4, H, W, 3))
+    assert exr.read_frame(path, samples=8).samples == 8
+
+
+def test_idu_files(tmp_path):
+    images = noise(0, 4, H, W, 3)
+    for number, image in enumerate(images):
+        write(tmp_path / f"box[1]_128spp_randImg_{number}.exr", layer("", image))
+        write(tmp_path / f"box[1]_128spp_corrImg_{number}.exr", layer("", 2 * image))
+    frame = exr.read_frame(tmp_path / "box[1]_128spp_randImg_0.exr")
+    np.testing.assert_array_equal(frame.buffers.color, images)
+    assert frame.samples is None
+    frame = exr.read_frame(tmp_path / "box[1]_128spp_corrImg_2.exr", samples=128)
+    np.testing.assert_array_equal(frame.buffers.color, 2 * images)
+    with pytest.raises(ValueError, match=r"f\.exr: read as idu: its name does not end"):
+        exr.read_frame(write(tmp_path / "f.exr", layer("", image)), dialect="idu")
+
+
+@pytest.mark.parametrize("reference", ["ref", "reference", "GT", "target", "4096spp"])
+def test_oidn_training_files(tmp_path, reference):
+    color, truth = noise(0, H, W, 3), noise(1, H, W, 3)
+    normal = 2 * noise(3, H, W, 3) - 1  # not encoded
+    path = write(tmp_path / "a_view_0064spp.hdr.exr", layer("", color))
+    write(tmp_path / "a_view_0064spp.alb.exr", layer("", 2 * noise(2, H, W, 3)))
+    write(tmp_path / "a_view_0064spp.nrm.exr", layer("", normal))
+    write(tmp_path / "a_view_0016spp.hdr.exr", layer("", color))
+    best = write(tmp_path / f"a_view_{reference}.hdr.exr", layer("", truth))
+    write(tmp_path / "a_view_left_8192spp.hdr.exr", layer("", color))  # another scene
+    frame = exr.read_frame(path)
+    assert frame.samples == 64
+    np.testing.assert_array_equal(frame.color, color)
+    np.testing.assert_array_equal(frame.albedo, np.minimum(2 * noise(2, H, W, 3), 1))
+    np.testing.assert_array_equal(frame.normal, normal)
+    np.testing.assert_array_equal(frame.reference.image, truth)
+    assert exr.read_frame(best).reference is None
+    alone = write(tmp_path / "alone.hdr.exr", layer("", color))
+    assert exr.read_frame(alone).samples is None
+    (tmp_path / "a_view_0064spp.nrm.exr").write_text("not an image")
+    with pytest.raises(ValueError, match=r"a_view_0064spp\.nrm\.exr: not a readable"):
+        exr.read_frame(path)
+
+
 @pytest.mark.parametrize(
     ("data", "display"),
     [

@@ -11,7 +11,6 @@ whole one.
 """
 
 import importlib.resources
-import json
 import os
 import pathlib
 from typing import Any
@@ -22,7 +21,8 @@ from jaxtyping import ArrayLike
 
 from jscomb.exr import own
 from jscomb.exr.dialects import DIALECTS, recognise
-from jscomb.exr.files import Part, read_parts, write_parts
+from jscomb.exr.dialects.images import Asked
+from jscomb.exr.files import MAX_BYTES, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
 
 
@@ -48,16 +48,20 @@ def read_frame(
     samples: int | None = None,
     dialect: str | None = None,
     statistics: bool = True,
+    max_bytes: int = MAX_BYTES,
 ) -> Frame:
     """Read what a renderer wrote.
 
     Args:
-        path: an EXR file, or the directory of a Tungsten frame.
+        path: an EXR file, or the directory of a Tungsten frame. Of a frame in several
+            files, the one of its colour.
         samples: samples a pixel, for files that do not say (Mitsuba); overrides what a
             file says. Where a file holds statistics of single samples, the variance of
             the mean depends on it.
         dialect: a key of `dialects.DIALECTS`; recognised from the contents if None.
         statistics: read variances; without them a sample count is never needed.
+        max_bytes: that the pixels of each file may take in memory; a file that claims
+            more is refused before its pixels are read.
 
     Returns:
         the frame, in float32.
@@ -83,7 +87,7 @@ def read_frame(
         if name not in DIALECTS:
             known = ", ".join(DIALECTS)
             raise ValueError(f"unknown dialect {name!r}, expected one of {known}")
-        contents = DIALECTS[name](path, samples, statistics)
+        contents = DIALECTS[name](path, Asked(samples, statistics, max_bytes))
         return contents if isinstance(contents, Frame) else make_frame(**contents)
     except _MALFORMED as error:
         if path in str(error):
@@ -95,11 +99,12 @@ def read_frame(
 _MALFORMED = (ValueError, TypeError, AttributeError, KeyError, IndexError)
 
 
-def read_image(path: str | os.PathLike) -> Array:
+def read_image(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> Array:
     """Read only the colour of an EXR file of any dialect.
 
     Args:
         path: an EXR file, or the directory of a Tungsten frame.
+        max_bytes: as for `read_frame`.
 
     Returns:
         the full image, linear radiance, shape [H,W,C].
@@ -112,7 +117,7 @@ def read_image(path: str | os.PathLike) -> Array:
         >>> print(read_image(bundled()["cornell-glass-64"]).shape)
         (192, 192, 3)
     """
-    return read_frame(path, statistics=False).color
+    return read_frame(path, statistics=False, max_bytes=max_bytes).color
 
 
 def write_frame(
@@ -182,9 +187,7 @@ def write_image(
     array = np.asarray(image, np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image must have shape [H,W,3], got {array.shape}")
-    channels = {name: array[..., c] for c, name in enumerate("RGB")}
-    attributes = {own.PROVENANCE: json.dumps(provenance or {}, default=str)}
-    write_parts(os.fspath(path), [Part("", channels, attributes)])
+    write_frame(path, make_frame(array), provenance=provenance)
 
 
 def read_provenance(path: str | os.PathLike) -> dict[str, Any]:

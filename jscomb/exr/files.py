@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-MAX_BYTES = 8 * 2**30  # of all pixels of a file, in memory
-MAX_TILE_BYTES = 2**28
+MAX_BYTES = 8 * 2**30  # of all pixels of a file, in memory, unless asked otherwise
+MAX_TILE_BYTES = 2**28  # however much is asked for
 _BYTES = 4
 
 
@@ -36,12 +36,16 @@ class Part(NamedTuple):
     attributes: dict[str, Any]
 
 
-def read_parts(path: str, *, header_only: bool = False) -> list[Part]:
+def read_parts(
+    path: str, *, header_only: bool = False, max_bytes: int = MAX_BYTES
+) -> list[Part]:
     """Read a file whole, or not at all.
 
     Args:
         path: an EXR file.
         header_only: leave out the pixels: channels come back empty.
+        max_bytes: that the pixels may take in memory, as 32-bit numbers; refused by
+            what the header claims, before any pixel is read.
 
     Returns:
         its parts in order.
@@ -52,17 +56,14 @@ def read_parts(path: str, *, header_only: bool = False) -> list[Part]:
     """
     if not os.path.exists(path):
         raise FileNotFoundError(f"{path}: no such file")
+    if not os.path.isfile(path):  # a pipe would be waited for
+        raise ValueError(f"{path}: is not a file")
     headers = _open(path, header_only=True).parts
     for part in headers:
         _check_header(path, part.header)
-    claimed = sum(_claimed_bytes(part.header) for part in headers)
-    if claimed > MAX_BYTES:
-        raise ValueError(
-            f"{path}: claims {claimed / 2**30:.1f} GiB of pixels, the limit is "
-            f"{MAX_BYTES / 2**30:.0f} GiB"
-        )
     if header_only:
         return [Part(part.name(), {}, dict(part.header)) for part in headers]
+    _check_claims(path, [part.header for part in headers], max_bytes)
     parts = _open(path, header_only=False).parts
     if len(parts) != len(headers):
         raise ValueError(
@@ -161,6 +162,27 @@ def _claimed_bytes(header: dict[str, Any]) -> int:
     return max(areas) * len(header["channels"]) * _BYTES
 
 
+def _check_claims(path: str, headers: list[dict[str, Any]], max_bytes: int) -> None:
+    """Refuse what would take too much memory, before any pixel is read."""
+    claimed = sum(_claimed_bytes(header) for header in headers)
+    if claimed > max_bytes:
+        raise ValueError(
+            f"{path}: claims {claimed / 2**20:.1f} MiB of pixels, max_bytes allows "
+            f"{max_bytes / 2**20:.1f} MiB"
+        )
+    limit = min(max_bytes, MAX_TILE_BYTES)
+    for header in headers:
+        tiles = header.get("tiles")
+        if tiles is None:
+            continue
+        claimed = tiles.xSize * tiles.ySize * len(header["channels"]) * _BYTES
+        if claimed > limit:
+            raise ValueError(
+                f"{path}: claims tiles of {claimed / 2**20:.1f} MiB, the limit is "
+                f"{limit / 2**20:.1f} MiB"
+            )
+
+
 _WINDOWS = ("dataWindow", "displayWindow")
 
 
@@ -175,14 +197,6 @@ def _check_header(path: str, header: dict[str, Any]) -> None:
     kind = header.get("type", OpenEXR.scanlineimage)
     if kind not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise ValueError(f"{path}: deep images are not supported, only flat ones")
-    tiles = header.get("tiles")
-    if tiles is not None:
-        size = tiles.xSize * tiles.ySize * len(header["channels"]) * _BYTES
-        if size > MAX_TILE_BYTES:
-            raise ValueError(
-                f"{path}: claims tiles of {size / 2**20:.0f} MiB, the limit is "
-                f"{MAX_TILE_BYTES / 2**20:.0f} MiB"
-            )
     for channel in header["channels"]:
         if (channel.xSampling, channel.ySampling) != (1, 1):
             raise ValueError(f"{path}: channel {channel.name} is subsampled")

@@ -8,9 +8,10 @@
     reference       R G B, half_difference.R ...
 
 Two attributes of the first part are JSON (EXR's own numeric ones would mangle large
-integers and lists): `jscomb`, format version, sample count and a checksum of each part
-(ZIP has one too, but EXR stores chunks that do not shrink, such as noise, without it);
-`provenance`, where the file came from, which plain images carry too.
+integers and lists): `jscomb`, format version, sample count, a checksum of each part
+(ZIP has one too, but EXR stores chunks that do not shrink, such as noise, without it)
+and one of the two attributes; `provenance`, where the file came from. Version 1 had no
+checksum of attributes and channel names.
 """
 
 import json
@@ -27,7 +28,7 @@ from jscomb.frame import Biased, Frame, Reference, make_frame
 
 ATTRIBUTE = "jscomb"
 PROVENANCE = "provenance"
-VERSION = 1
+VERSION = 2
 LETTERS = string.ascii_lowercase
 SUFFIXES = {"albedo": "RGB", "normal": "XYZ", "depth": "Z", "visibility": "Y"}
 HALF_MAX = float(np.finfo(np.float16).max)
@@ -107,10 +108,9 @@ def to_parts(
         "sub_buffers": k,
         "crc32": checksums,
     }
-    attributes = {
-        ATTRIBUTE: json.dumps(about),
-        PROVENANCE: json.dumps(provenance, default=str),
-    }
+    origin = json.dumps(provenance, default=str)
+    seal = {"header crc32": _seal(about, origin)}
+    attributes = {ATTRIBUTE: json.dumps(about | seal), PROVENANCE: origin}
     return [
         Part(name, channels, attributes if name == "a" else {})
         for name, channels in parts.items()
@@ -132,20 +132,15 @@ def from_parts(parts: list[Part], samples: int | None, statistics: bool) -> Fram
         ValueError: if the format is newer than this code, a checksum does not fit, or
             a part or channel is missing.
     """
-    try:
-        about = json.loads(parts[0].attributes[ATTRIBUTE])
-        version = about["version"]
-        checksums, letters = dict(about["crc32"]), LETTERS[: about["sub_buffers"]]
-    except (TypeError, ValueError, KeyError):
-        raise ValueError(f"attribute {ATTRIBUTE} is malformed") from None
-    if version != VERSION:
-        raise ValueError(f"format version {version} is not known, only {VERSION}")
+    about = _about(parts)
+    checksums, letters = about["crc32"], LETTERS[: about["sub_buffers"]]
     by_name = {part.name: part for part in parts}
     if by_name.keys() != checksums.keys():
         wanted, got = ", ".join(checksums), ", ".join(by_name)
         raise ValueError(f"it must have the parts {wanted}, but has {got}")
     for name, part in by_name.items():
-        if _checksum(part.channels) != checksums[name]:
+        found = _checksum(part.channels, names=about["version"] > 1)
+        if found != checksums[name]:
             raise ValueError(f"part {name} is corrupt: its checksum does not fit")
 
     def rgb(name: str) -> Array:
@@ -195,7 +190,7 @@ def provenance(parts: list[Part]) -> dict[str, Any]:
     Returns:
         the provenance, empty if there is none.
     """
-    text = parts[0].attributes.get(PROVENANCE, "{}")
+    text = _first(parts).attributes.get(PROVENANCE, "{}")
     try:
         found = json.loads(text)
     except (TypeError, ValueError):
@@ -210,14 +205,42 @@ def is_own(parts: list[Part]) -> bool:
         parts: of any file; headers suffice.
 
     Returns:
-        True if it carries the attribute.
+        True if it carries the attribute, or all else that tells.
     """
-    return ATTRIBUTE in parts[0].attributes
+    name, _, attributes = _first(parts)
+    return ATTRIBUTE in attributes or (name == LETTERS[0] and PROVENANCE in attributes)
 
 
-def _checksum(channels: dict[str, np.ndarray]) -> int:
-    """CRC-32 over the pixels of all channels, by name."""
-    total = 0
+def _first(parts: list[Part]) -> Part:
+    """The part with the attributes, wherever other programs have put it."""
+    return next((part for part in parts if ATTRIBUTE in part.attributes), parts[0])
+
+
+def _about(parts: list[Part]) -> dict[str, Any]:
+    """What the attribute holds, if it is as it was written."""
+    attributes = _first(parts).attributes
+    try:
+        about = json.loads(attributes[ATTRIBUTE])
+        version, seal = about["version"], about.pop("header crc32", None)
+        about = about | {"crc32": dict(about["crc32"])}
+        _ = about["sub_buffers"]
+    except (TypeError, ValueError, KeyError, AttributeError):
+        raise ValueError(f"attribute {ATTRIBUTE} is malformed") from None
+    if version not in (1, VERSION):
+        raise ValueError(f"format version {version} is not known, only up to {VERSION}")
+    if version > 1 and seal != _seal(about, attributes.get(PROVENANCE)):
+        raise ValueError(f"attribute {ATTRIBUTE} or {PROVENANCE} is corrupt")
+    return about
+
+
+def _seal(about: dict[str, Any], provenance: Any) -> int:
+    """CRC-32 of both attributes."""
+    return zlib.crc32(json.dumps([about, provenance]).encode())
+
+
+def _checksum(channels: dict[str, np.ndarray], *, names: bool = True) -> int:
+    """CRC-32 over the pixels of all channels, by name, and over the names."""
+    total = zlib.crc32(" ".join(sorted(channels)).encode()) if names else 0
     for name in sorted(channels):
         total = zlib.crc32(channels[name].tobytes(), total)
     return total
