@@ -29,6 +29,9 @@ from experiments.work import Work, rates, work_of
 from jscomb import exr
 
 
+LONG = 6.0  # seconds after which a warm-up makes no difference
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """What to measure.
@@ -86,16 +89,17 @@ def measure(function: Callable[[Rendering], Any], r: Rendering, best: Work) -> C
         best: the machine's rates.
 
     Returns:
-        its cost; the median of as many calls as fit into some seconds.
+        its cost; the median of some calls after the first, or that if it is long.
     """
     start = time.perf_counter()
     program = jax.jit(function).lower(r).compile()
     compiling = time.perf_counter() - start
     start = time.perf_counter()
     jax.block_until_ready(program(r))
-    first = time.perf_counter() - start
-    repeats = min(7, max(1, math.ceil(3 / first)))
-    seconds = medians({"": lambda: program(r)}, repeats)[""]
+    seconds = time.perf_counter() - start
+    if seconds < LONG:
+        repeats = min(7, math.ceil(LONG / 2 / seconds))
+        seconds = medians({"": lambda: program(r)}, repeats)[""]
     memory = program.memory_analysis().temp_size_in_bytes
     ceiling = work_of(function, r).seconds(best)
     return Cost(seconds, ceiling, memory, compiling)
@@ -139,6 +143,30 @@ def run(config: Config) -> dict[str, dict[int, Cost]]:
     return {name: {size: known[name][size] for size in sizes} for name in wanted}
 
 
+def row(name: str, costs: dict[int, Cost]) -> str:
+    """One line of the table.
+
+    Args:
+        name: of the function.
+        costs: at two sizes, the smaller first.
+
+    Returns:
+        a line of Markdown, per pixel of the larger size.
+    """
+    (small, first), (large, last) = costs.items()
+    pixels = large**2
+    growth = math.log(last.seconds / first.seconds) / math.log(pixels / small**2)
+    cells = [
+        f"{1e6 * last.seconds / pixels:.3g}",
+        f"{1e6 * last.ceiling / pixels:.2g}",
+        f"{last.seconds / last.ceiling:.2g}",
+        f"{first.memory / small**2:.0f}, {last.memory / pixels:.0f}",
+        f"{growth:.2f}",
+        f"{first.compiling:.1f}",
+    ]
+    return f"| `{name}` | {' | '.join(cells)} |"
+
+
 def main() -> None:
     """Print the table."""
     config = tyro.cli(Config, description=__doc__)
@@ -146,18 +174,7 @@ def main() -> None:
     print("| function | s/Mpx | ceiling | ratio | B/pixel | growth | compiling: s |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, costs in table.items():
-        (small, first), (large, last) = costs.items()
-        pixels = large**2
-        growth = math.log(last.seconds / first.seconds) / math.log(pixels / small**2)
-        cells = [
-            f"{1e6 * last.seconds / pixels:.3g}",
-            f"{1e6 * last.ceiling / pixels:.2g}",
-            f"{last.seconds / last.ceiling:.2g}",
-            f"{last.memory / pixels:.0f}",
-            f"{growth:.2f}",
-            f"{first.compiling:.1f}",
-        ]
-        print(f"| `{name}` | {' | '.join(cells)} |")
+        print(row(name, costs))
 
 
 if __name__ == "__main__":
