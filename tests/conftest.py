@@ -46,7 +46,7 @@ def few_programs():
     """
     yield
     seldom = next(_TESTS) % 20 == 0  # to count takes a while
-    if seldom and MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > 45_000:
+    if seldom and MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > 30_000:
         jax.clear_caches()
 
 
