@@ -30,16 +30,13 @@ from jscomb.denoisers import (
     rdfc,
     smoothing,
 )
-from jscomb.learning import networks
+from jscomb.learning import methods, networks
 from jscomb.numerics import poisson, regression, simplex, sure
 from jscomb.numerics.guards import finite, first_finite
 from jscomb.numerics.weights import noise_free_weights
 from jscomb.typing import Image, Scalar
 
 SAMPLES = 8  # in each sub-average
-BLOCK = 4  # pixels that a U-Net pools to one
-# Two convolutions of 3x3 on each way through levels of pixels, pairs and blocks.
-U_NET = 2 * (2 * 1 + 2 * 2) + 2 * BLOCK + BLOCK - 1
 
 
 class Entry(NamedTuple):
@@ -176,8 +173,8 @@ def combiners() -> dict[str, Entry]:
             lambda r: james_stein.neural_combine(
                 njs, r.unbiased, *halves(r)[2:], r.variance, exposure=r.unit
             ),
-            U_NET + 1 + 7 + 14,
-            multiple=BLOCK,
+            methods._U_NET + 1 + 7 + 14,
+            multiple=methods._BLOCK,
         ),
         "ensemble.combine": Entry(_ensemble, rounding=1e-4),
         "ensemble.combine multi-scale": Entry(
@@ -203,8 +200,8 @@ def combiners() -> dict[str, Entry]:
             lambda r: double_shrinkage.neural_combine(
                 dsc, prior(r), *xyv(r)[:2], r.grey, r.grey / 4, exposure=r.unit
             ),
-            U_NET + 6 + 1,
-            multiple=BLOCK,
+            methods._U_NET + 6 + 1,
+            multiple=methods._BLOCK,
         ),
         "progressive.combine": Entry(lambda r: progressive.combine(*xyv(r), risk(r))),
         "progressive.neural_combine": Entry(
@@ -257,8 +254,8 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
             lambda r: kernel_predicting.denoise(
                 network, r.unbiased, r.variance, seven(r), exposure=r.unit
             ),
-            U_NET + 1 + 5,
-            multiple=BLOCK,
+            methods._U_NET + 1 + 5,
+            multiple=methods._BLOCK,
         ),
         "james_stein.cross_regression": Entry(
             _at_one(

@@ -16,11 +16,11 @@ import time
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from tqdm import tqdm
 
+from experiments.rendering import mirrored
 from experiments.timing import apart
 from jscomb import choice, exr
 from jscomb.frame import Frame
@@ -68,7 +68,7 @@ class Row(NamedTuple):
     difference: float | None
 
 
-def mirrored(frame: Frame, size: int) -> Frame:
+def enlarged(frame: Frame, size: int) -> Frame:
     """A frame of `size` x `size` pixels.
 
     Args:
@@ -76,21 +76,11 @@ def mirrored(frame: Frame, size: int) -> Frame:
         size: in pixels.
 
     Returns:
-        the frame, mirrored at its borders again and again; its biased image without
-        halves, so that no method makes it anew.
+        the frame, mirrored at its borders; its biased image without halves, so that no
+        method makes it anew.
     """
-
-    def grown(image: jax.Array) -> jax.Array:
-        if image.ndim < 3:
-            return image
-        height, width = image.shape[-3:-1]
-        ends = [(0, 0)] * (image.ndim - 3)
-        ends += [(0, size - height), (0, size - width), (0, 0)]
-        return jnp.asarray(np.pad(image, ends, mode="symmetric"))
-
     y = frame.biased["oidn"]._replace(halves=None)
-    bare = frame._replace(biased={"oidn": y}, reference=None)
-    return jax.tree.map(grown, bare)
+    return mirrored(frame._replace(biased={"oidn": y}, reference=None), size)
 
 
 def measure(
@@ -107,7 +97,7 @@ def measure(
     Returns:
         width of a tile, seconds, mebibytes, and the image.
     """
-    frame = mirrored(exr.read_frame(config.frame), size)
+    frame = enlarged(exr.read_frame(config.frame), size)
     found = choice.local(jax.random.key(0), frame, "oidn", method=method)
     tile = size
     if not whole:

@@ -28,7 +28,7 @@ from experiments.timing import medians
 from experiments.work import Work, rates, work_of
 from jscomb import exr
 
-LONG = 6.0  # seconds after which a warm-up makes no difference
+LONG = 1.5  # seconds after which a warm-up makes no difference
 
 
 @dataclasses.dataclass(frozen=True)

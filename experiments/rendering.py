@@ -1,6 +1,6 @@
 """A frame's images as one tree of arrays, what functions are tried and timed on."""
 
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,8 @@ from jscomb.denoisers import smoothing
 from jscomb.features import select, stack
 from jscomb.frame import Frame
 from jscomb.typing import Image, Scalar, Variance
+
+Tree = TypeVar("Tree")
 
 
 class Rendering(NamedTuple):
@@ -74,20 +76,27 @@ def rendering_of(frame: Frame, *, name: str = "oidn") -> Rendering:
     return Rendering(*images, frame.exposure)
 
 
-def mirrored(r: Rendering, size: int) -> Rendering:
-    """A rendering of `size` x `size` pixels.
+def mirrored(images: Tree, size: int) -> Tree:
+    """Images of `size` x `size` pixels.
 
     Args:
-        r: of at most as many.
+        images: a tree of arrays, of at most as many pixels, [...,H,W,C]; what has fewer
+            axes stays as it is.
         size: in pixels.
 
     Returns:
-        the rendering, mirrored at its borders again and again.
+        the tree, its images mirrored at their borders again and again.
     """
-    height, width = r.unbiased_a.shape[:2]
-    ends = [(0, size - height), (0, size - width), (0, 0)]
-    grown = [jnp.asarray(np.pad(i, ends, mode="symmetric")) for i in r[:-1]]
-    return Rendering(*grown, r.unit)
+
+    def grown(image: jax.Array) -> jax.Array:
+        if image.ndim < 3:
+            return image
+        height, width = image.shape[-3:-1]
+        ends = [(0, 0)] * (image.ndim - 3)
+        ends += [(0, size - height), (0, size - width), (0, 0)]
+        return jnp.asarray(np.pad(image, ends, mode="symmetric"))
+
+    return jax.tree.map(grown, images)
 
 
 def bases(r: Rendering) -> tuple[jax.Array, jax.Array]:

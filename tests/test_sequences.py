@@ -109,7 +109,7 @@ def test_large_frames_of_any_size(glass_frame):
     assert row.tile < 256
     assert row.difference < 1e-6
     assert row.seconds > 0
-    grown = large.mirrored(glass_frame, 100)
+    grown = large.enlarged(glass_frame, 100)
     assert grown.color.shape == (100, 100, 3)
     np.testing.assert_array_equal(grown.color[:64, :64], glass_frame.color)
     np.testing.assert_array_equal(grown.color[64:], grown.color[28:64][::-1])
