@@ -55,7 +55,7 @@ def quadratic(matrix: Matrix) -> Weights:
 def _least(matrix: Float[Array, "n n m"]) -> Flat:
     """The same of M problems."""
     matrix = _known(matrix)
-    objective = objective_of(matrix)
+    objective = _objective(matrix)
     fixed = Objective(*lax.stop_gradient(tuple(objective)))
     best = jnp.argmin(_diagonal(matrix), axis=0, keepdims=True)
     start = jnp.arange(len(matrix))[:, None] == best
@@ -147,8 +147,12 @@ def objective_of(matrix: Matrix) -> Objective:
     """
     _check(matrix)
     n = len(matrix)
-    m = _known(matrix.reshape(n, n, -1))
-    diagonal = _diagonal(m)
+    return _objective(_known(matrix.reshape(n, n, -1)))
+
+
+def _objective(m: Float[Array, "n n m"]) -> Objective:
+    """The same of finite matrices."""
+    n, diagonal = len(m), _diagonal(m)
     best = jnp.arange(n)[:, None] == jnp.argmin(diagonal, axis=0)[None]
     column = jnp.sum(jnp.where(best[None], m, 0.0), axis=1)  # M_ib
     lowest = jnp.sum(jnp.where(best, diagonal, 0.0), axis=0)  # M_bb
