@@ -17,9 +17,14 @@ from jscomb import (
     uncorrelated,
 )
 from jscomb.denoisers import nfor
-from jscomb.numerics import bilateral, cholesky, convolution, exposure, kernels, windows
+from jscomb.numerics import cholesky, convolution, exposure, kernels, windows
 from jscomb.numerics import sure as risks
-from jscomb.numerics.weights import feature_weights, gaussian_weights, weighted_mean
+from jscomb.numerics.weights import (
+    bilateral_weights,
+    feature_weights,
+    gaussian_weights,
+    weighted_mean,
+)
 
 Function = Callable[[Rendering], Any]
 WINDOW = 15
@@ -95,8 +100,10 @@ def parts() -> dict[str, Function]:
         "weights.feature_weights": lambda r: weighted_mean(
             r.unbiased, feature_weights(r.features), window=WINDOW
         ),
-        "bilateral.bilateral_mean": lambda r: bilateral.bilateral_mean(
-            *_of_radiance(r)[:2], r.biased, r.variance, window=WINDOW, sigma=3.0
+        "weights.bilateral_weights": lambda r: weighted_mean(
+            r.unbiased,
+            bilateral_weights(r.biased, r.biased, r.variance, sigma=3.0),
+            window=WINDOW,
         ),
         "kernels.predicted_mean": _predicted,
         "convolution.convolve": _convolved,
@@ -123,7 +130,9 @@ def parts() -> dict[str, Function]:
 def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
     """Parts of the papers' methods."""
     shared = lambda r: jnp.square(r.biased_a - r.biased_b) / 4
-    weights = lambda r: jnp.full((3, *r.unbiased.shape), 1 / 3, r.unbiased.dtype)
+    # Out of the images: constants would be worked on while the program is compiled.
+    share = lambda r: jnp.clip(r.unbiased, 0.0, 0.5)
+    weights = lambda r: jnp.stack([share(r), share(r), 1 - 2 * share(r)])
     return {
         "james_stein.risk": lambda r: james_stein.risk(*_of_radiance(r)),
         "james_stein.smooth_variance": lambda r: james_stein.smooth_variance(
@@ -160,10 +169,10 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         ),
         "progressive.mixing": lambda r: progressive.mixing(*_of_radiance(r), _sure(r)),
         "progressive.bound_mixing": lambda r: progressive.bound_mixing(
-            jnp.full_like(r.unbiased, 0.5), *_of_radiance(r)
+            share(r), *_of_radiance(r)
         ),
         "progressive.risk": lambda r: progressive.risk(
-            jnp.full_like(r.unbiased, 0.5), *_of_radiance(r), _sure(r)
+            share(r), *_of_radiance(r), _sure(r)
         ),
         "progressive.activation": lambda r: progressive.activation(
             jnp.stack(r[:3], axis=2)

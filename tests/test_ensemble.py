@@ -10,7 +10,7 @@ from jscomb import ensemble
 from jscomb.denoisers import smoothing
 from jscomb.frame import Biased
 from jscomb.numerics import simplex
-from jscomb.numerics.bilateral import bilateral_mean
+from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from tests.statistics import assert_mean, assert_mean_below
 
 RNG = np.random.default_rng(4)
@@ -144,11 +144,12 @@ def test_shared_or_each_channel():
     )
 
 
-def bilateral_by_loops(image, guide, noisy, variance, *, window, sigma):
+def bilateral_by_loops(image, guide, noisy, variance, window, sigma):
     """Every pair of pixels, in float64."""
     every = np.concatenate([image, guide, noisy, variance], -1)
     valid = np.isfinite(every).all(-1)
-    out, r = np.zeros_like(image), window // 2
+    finite = np.isfinite(image).all(-1, keepdims=True)
+    out, r = np.where(finite, image, 0.0), window // 2
     for p in np.argwhere(valid):
         total, weight = 0, 0
         for q in np.argwhere(valid):
@@ -177,11 +178,15 @@ def test_the_filter_is_the_loops(size):
     if size == (9, 12):
         noisy[4, 5, 0], guide[2, 2, 1] = np.nan, np.inf
     data = image, guide, noisy, variance
-    options = {"window": 5, "sigma": 2.0}
-    filtered = jax.jit(lambda *i: bilateral_mean(*i, **options))
+
+    @jax.jit
+    def filtered(image, *guides):
+        alike = bilateral_weights(*guides, sigma=2.0)
+        return weighted_mean(image, alike, window=5)
+
     arrays = [jnp.asarray(i) for i in data]
     np.testing.assert_allclose(
-        filtered(*arrays), bilateral_by_loops(*data, **options), rtol=1e-9, atol=1e-12
+        filtered(*arrays), bilateral_by_loops(*data, 5, 2.0), rtol=1e-9, atol=1e-12
     )
     total = lambda *i: filtered(*i).sum()
     for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*arrays):

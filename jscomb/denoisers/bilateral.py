@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 from jscomb.denoisers.parts import of_parts
 from jscomb.features import stack
 from jscomb.frame import Biased, Frame
-from jscomb.numerics.bilateral import bilateral_mean
 from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Variance
 
@@ -67,15 +67,15 @@ def denoise(
     smooth, noise = (
         window_mean(i, _POOL, mask=finite(image, variance)) for i in (image, variance)
     )
-    filtered = bilateral_mean(
-        image,
+    weights = bilateral_weights(
         features / (2**0.5 * sigma_features),
         smooth / (2**0.5 * sigma_radiance),
         noise,
-        window=window,
         sigma=sigma,
     )
-    return jnp.where(finite(image, variance, features), filtered, first_finite(image))
+    filtered = weighted_mean(image, weights, window=window)
+    # The smoothed image is finite around a pixel of infinite variance, too.
+    return jnp.where(finite(variance), filtered, first_finite(image))
 
 
 # Called with values, a loop over tiles would be compiled anew each time.

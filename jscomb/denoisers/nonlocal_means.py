@@ -20,13 +20,14 @@ Sources:
     information", 2013 (the distance).
 """
 
+import functools
+
 import jax.numpy as jnp
-import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, finite
-from jscomb.numerics.tiles import Grid, Planes
-from jscomb.numerics.weights import Weights, weighted_mean
+from jscomb.numerics.weights import Pairs, Weights, weighted_mean
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image
 
@@ -118,71 +119,36 @@ def weights(
     # Where not valid the planes are 0, and so is the last.
     image = jnp.concatenate([guide, variance, jnp.where(valid > 0, valid, jnp.nan)], -1)
 
-    def function(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-        return _tile_weights(planes, grid, patch, strength)
-
-    return Weights(image, function, halo)
+    return Weights(image, functools.partial(_alike, patch, strength), halo)
 
 
-def _tile_weights(
-    planes: Planes, grid: Grid, patch: int, strength: float
-) -> Float[Array, "m n"]:
-    """Weights of all pixels of a tile's neighbourhood for each centre.
-
-    One row of offsets at a time: distances of the tile's pixels, and `halo` around
-    them, to those at the offsets; mean over the patch; then from offsets to places.
-    """
-    r, halo = grid.reach, patch // 2
-    offsets, inner = 2 * r + 1, grid.step + 2 * halo
-    centre = planes[:, r : r + inner, r : r + inner, None]
-    columns = jnp.arange(inner)[:, None] + jnp.arange(offsets)[None]
-    shares = []
-    for dy in range(offsets):
-        moved = planes[:, dy : dy + inner][:, :, columns]
-        distance, known = _distance(centre, moved, strength)
-        total, count = (_patch_sum(i, patch) for i in (distance, known))
-        mean = divide(total, count, where=count > 0, otherwise=_FARTHEST)
-        shares.append(jnp.exp(-jnp.maximum(mean, 0.0)))
-    w = _place(jnp.stack(shares))  # [offset row, row, column, near column]
-    w = _place(jnp.transpose(w, (2, 3, 1, 0)))  # [column, near column, row, near row]
-    n = grid.width(r)
-    w = jnp.transpose(w, (2, 0, 3, 1)).reshape(grid.step**2, n * n)
-    rows, columns = grid.places
-    return w[rows * grid.step + columns]
+def _alike(patch: int, strength: float, p: Pairs, q: Pairs) -> Array:
+    """The weights of pairs of pixels; those `patch // 2` from the border have none."""
+    distance, known = _distance(p, q, strength)
+    total, count = (_patch_sum(i, patch) for i in (distance, known))
+    mean = divide(total, count, where=count > 0, otherwise=_FARTHEST)
+    return jnp.exp(-jnp.maximum(mean, 0.0))
 
 
-def _distance(
-    p: Float[Array, "k h w 1"], q: Float[Array, "k h w o"], strength: float
-) -> tuple[Float[Array, "h w o"], Float[Array, "h w o"]]:
+def _distance(p: Pairs, q: Pairs, strength: float) -> tuple[Array, Array]:
     """d2 of each pair, mean over the channels, and 1 where both are valid, else 0."""
     channels = len(p) // 2
-    u_p, u_q, v_p, v_q = p[:channels], q[:channels], p[channels:-1], q[channels:-1]
     known = p[-1] * q[-1]
-    difference = jnp.square(u_p - u_q) - (v_p + jnp.minimum(v_p, v_q))
-    noise = strength**2 * (v_p + v_q)
-    near = (noise * _FARTHEST > difference) & (noise > 0)
-    far = jnp.where(difference > 0, _FARTHEST, jnp.zeros_like(difference))
-    d2 = divide(difference, noise, where=near, otherwise=far)
-    return jnp.mean(d2, axis=0) * known, known
+    total = jnp.zeros((), known.dtype)
+    for k in range(channels):  # plane by plane: a mean over an axis is not vectorised
+        u_p, u_q, v_p, v_q = p[k], q[k], p[channels + k], q[channels + k]
+        difference = jnp.square(u_p - u_q) - (v_p + jnp.minimum(v_p, v_q))
+        noise = strength**2 * (v_p + v_q)
+        near = (noise * _FARTHEST > difference) & (noise > 0)
+        far = jnp.where(difference > 0, _FARTHEST, jnp.zeros_like(difference))
+        total += divide(difference, noise, where=near, otherwise=far)
+    return total / channels * known, known
 
 
-def _patch_sum(values: Float[Array, "h w o"], patch: int) -> Float[Array, "_ _ o"]:
-    """Sums over the patches that lie inside: two small matrix products."""
-    inner = values.shape[0]
-    start = np.arange(inner - patch + 1)[:, None]
-    at = np.arange(inner)[None]
-    band = jnp.asarray((start <= at) & (at < start + patch), values.dtype)
-    return jnp.einsum("ph,qw,hwo->pqo", band, band, values, precision="highest")
-
-
-def _place(w: Float[Array, "a b t o"]) -> Float[Array, "a b t n"]:
-    """From offsets [.., t, o] to places [.., t, t + o], 0 elsewhere.
-
-    Row t is to be moved t places to the right: in memory that is one place more for
-    each row, which is what a row longer by one does.
-    """
-    *outer, count, offsets = w.shape
-    n = count + offsets - 1
-    longer = jnp.pad(w, [(0, 0)] * (w.ndim - 1) + [(0, count)])
-    flat = longer.reshape(*outer, count * (n + 1))
-    return flat[..., : count * n].reshape(*outer, count, n)
+def _patch_sum(values: Array, patch: int) -> Array:
+    """Sums over the patches that lie inside, along the first two axes."""
+    for axis in (0, 1):
+        size = tuple(patch if a == axis else 1 for a in range(values.ndim))
+        strides = (1,) * values.ndim
+        values = lax.reduce_window(values, 0.0, lax.add, size, strides, "VALID")
+    return values

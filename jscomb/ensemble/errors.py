@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.medians import median_of
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Mask
 
@@ -218,7 +219,7 @@ def evidence_of(
     y_a, y_b, x_a, x_b = map(clean, (biased_a, biased_b, unbiased_a, unbiased_b))
     means = jnp.mean(y_a, axis=0), jnp.mean(y_b, axis=0)
     # The median: one base may carry a light's glow far beyond the light.
-    typical = (jnp.median(y_a, axis=0) + jnp.median(y_b, axis=0)) / 2
+    typical = (median_of(y_a) + median_of(y_b)) / 2
     bright = jnp.mean(typical, axis=-1, keepdims=True)
     count = jnp.maximum(jnp.sum(valid), 1).astype(bright.dtype)
     square = jnp.square(bright) + _LEAST * jnp.square(jnp.sum(bright) / count)

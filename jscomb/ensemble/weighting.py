@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from jscomb.ensemble.errors import SCALES, Bases, check_bases, error_matrix
 from jscomb.numerics import simplex
-from jscomb.numerics.bilateral import bilateral_mean
 from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.typing import Image, Key, Variance
 
 Solver = Literal["hull", "iterative", "reference", "multi-scale"]
@@ -190,7 +190,7 @@ def filter_weights(
 
     Returns:
         the filtered weights, shape [N,H,W,C]; those of pixels that are not finite in
-        some input are the weights as they were.
+        some guide are the weights as they were.
 
     Raises:
         ValueError: while tracing, if shapes differ or `sigma` is not positive.
@@ -218,16 +218,10 @@ def filter_weights(
     none = jnp.zeros((h, w, 0), combined.dtype)
     guide = jnp.concatenate([none, *scaled], axis=-1)
     flat = jnp.moveaxis(weights, 0, 2).reshape(h, w, n * c)
-    filtered = bilateral_mean(
-        flat,
-        guide,
-        combined / (2**0.5 * sigma_radiance),
-        variance,
-        window=2 * radius + 1,
-        sigma=sigma,
+    alike = bilateral_weights(
+        guide, combined / (2**0.5 * sigma_radiance), variance, sigma=sigma
     )
-    known = finite(flat, guide, combined, variance)
-    filtered = jnp.where(known, filtered, flat)
+    filtered = weighted_mean(flat, alike, window=2 * radius + 1)
     return jnp.moveaxis(filtered.reshape(h, w, n, c), 2, 0)
 
 

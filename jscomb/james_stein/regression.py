@@ -30,13 +30,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.features import select, stack
 from jscomb.frame import Biased, Frame
 from jscomb.metrics import Change, mean_change
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.numerics.medians import median
 from jscomb.numerics.regression import local_linear
 from jscomb.typing import Image, Key, Scalar, Variance
 
@@ -211,14 +211,9 @@ def guide_noise(biased_a: Image, biased_b: Image, *, robust: bool = True) -> Sca
     valid = finite(biased_a, biased_b)
     difference = jnp.where(valid, biased_a - biased_b, 0.0)
     square = jnp.sum(jnp.square(difference), axis=-1, keepdims=True) / 2
-    count = jnp.sum(valid)
-    if not robust:
-        return jnp.sum(square) / jnp.maximum(count, 1).astype(square.dtype)
-    ordered = jnp.sort(jnp.where(valid, square, jnp.inf), axis=None)
-    middle = lax.dynamic_index_in_dim(
-        ordered, jnp.maximum(count - 1, 0) // 2, keepdims=False
-    )
-    return jnp.where(count > 0, middle, 0.0)
+    if robust:
+        return median(square, valid)
+    return jnp.sum(square) / jnp.maximum(jnp.sum(valid), 1).astype(square.dtype)
 
 
 def worth_regressing(

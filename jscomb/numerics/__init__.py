@@ -1,11 +1,11 @@
 """Mathematics shared by the combiners; nothing here knows about a paper."""
 
-from jscomb.numerics import bilateral as bilateral
 from jscomb.numerics import cholesky as cholesky
 from jscomb.numerics import convolution as convolution
 from jscomb.numerics import exposure as exposure
 from jscomb.numerics import guards as guards
 from jscomb.numerics import kernels as kernels
+from jscomb.numerics import medians as medians
 from jscomb.numerics import poisson as poisson
 from jscomb.numerics import regression as regression
 from jscomb.numerics import simplex as simplex

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jscomb.numerics.medians import median
 from jscomb.typing import Image, Mask, Scalar
 
 
@@ -24,8 +25,7 @@ def exposure(image: Image) -> Scalar:
     """
     luminance = jnp.mean(image, axis=-1)
     lit = jnp.isfinite(luminance) & (luminance > 0)
-    median = jnp.nanmedian(jnp.where(lit, luminance, jnp.nan))
-    return jnp.where(jnp.any(lit), median, 1.0)
+    return jnp.where(jnp.any(lit), median(luminance, lit), 1.0)
 
 
 def in_units(

@@ -47,7 +47,7 @@ from jaxtyping import Array, Float
 from jscomb.numerics import cholesky
 from jscomb.numerics.guards import check_same_shape, divide, finite
 from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
-from jscomb.numerics.weights import Weights, gaussian_weights
+from jscomb.numerics.weights import Weights, gaussian_weights, tile_weights
 from jscomb.numerics.windows import check_window, window_max, window_min
 from jscomb.typing import Image, Mask, Scalar
 
@@ -189,7 +189,7 @@ def joint_local_linear(
         basis, centred = _centred(basis, grid)
         scale = jnp.where(centred[None], grid.centres(scale), 1.0)
         weights = [
-            jnp.where(inside, kernel.function(plane, grid), 0.0)
+            jnp.where(inside, tile_weights(kernel, plane, grid), 0.0)
             for kernel, plane in zip(kernels, planes[len(targets) :], strict=True)
         ]
         moments = [

@@ -1,9 +1,11 @@
-"""How the windows of a tile weigh their pixels.
+"""How alike two pixels are, as the weight of one in the other's window.
 
-A weight is a function of a tile's neighbourhood, so that no more than a batch of tiles'
-weights exists at a time. `denoisers.nonlocal_means` has another kind.
+A weight is a function of pairs of pixels. A mean over windows walks the window and
+holds one weight a pixel at a time; a regression wants all weights of a tile at once, as
+a matrix. `denoisers.nonlocal_means` has another kind.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,11 +14,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
-from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
+from jscomb.numerics.tiles import (
+    Grid,
+    Planes,
+    Region,
+    flat,
+    fold_rows,
+    sum_over_tiles,
+)
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Scalar
 
-_TILE, _TILES = 16, 4
+# A noisy guide's distance beyond which a weight is 0 in any precision.
+_FARTHEST = 1e4
+_TILE, _TILES = 64, 2
+
+Pairs = Float[Array, "_ _ _ ..."]  # planes of pixels, one of each pair
 
 
 class Weights(NamedTuple):
@@ -24,14 +37,14 @@ class Weights(NamedTuple):
 
     Attributes:
         image: what the weights are made from, [H,W,K].
-        function: planes of a tile's neighbourhood, [K,n,n], to weights [M,N] of its
-            centres and pixels, finite and at least zero whatever the planes hold. The
-            grid tells where the centres are.
-        halo: pixels around the neighbourhood that `function` sees besides.
+        pair: planes of the windows' centres and of pixels in them, [K,h,w,...], to the
+            pairs' weights [h,w,...], finite and at least zero whatever the planes hold.
+        halo: pixels on every side of [h,w] that a weight depends on and that have none
+            themselves; with 0 the pairs need not be neighbours.
     """
 
     image: Float[Array, "h w k"]
-    function: Callable[[Planes, Grid], Float[Array, "m n"]]
+    pair: Callable[[Pairs, Pairs], Array]
     halo: int = 0
 
 
@@ -106,11 +119,11 @@ def noise_free_weights(
     """
     kernel = gaussian_weights(guide, 2 * variance + epsilon)
 
-    def function(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-        sum_of_both = _mean_of_both(planes[-1:], grid)
-        return kernel.function(planes, grid) * jnp.exp(1 - epsilon / sum_of_both)
+    def pair(p: Pairs, q: Pairs) -> Array:
+        sum_of_both = _mean_of_both(p[-1], q[-1])
+        return kernel.pair(p, q) * jnp.exp(1 - epsilon / sum_of_both)
 
-    return kernel._replace(function=function)
+    return kernel._replace(pair=pair)
 
 
 def feature_weights(
@@ -147,6 +160,64 @@ def feature_weights(
     return Weights(jnp.concatenate([features, strength**2 * slope], -1), _of_features)
 
 
+def bilateral_weights(
+    guide: Float[Array, "h w g"],
+    noisy: Float[Array, "h w z"],
+    variance: Float[Array, "h w z"],
+    *,
+    sigma: float,
+) -> Weights:
+    """Weights exp(-|p - q|^2 / 2 s^2 - |g_p - g_q|^2 - sum d_pq).
+
+    with d_pq = (z_p - z_q)^2 / (v_p + v_q) of each noisy channel.
+
+    Args:
+        guide: g, in units of its standard deviation times the root of 2, shape [H,W,G];
+            G may be 0.
+        noisy: z, a guide with noise, scaled likewise, shape [H,W,Z]; Z may be 0.
+        variance: v of the unscaled z, at least zero, shape [H,W,Z].
+        sigma: s > 0, standard deviation in pixels of the distance's share.
+
+    Returns:
+        the weights.
+
+    Raises:
+        ValueError: if `sigma` is not positive, or noisy and variance differ in shape.
+
+    Example:
+        >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
+        >>> edge = jnp.array([0.0, 0.0, 9.0, 9.0]).reshape(1, 4, 1)
+        >>> none = edge[..., :0]
+        >>> near = bilateral_weights(edge, none, none, sigma=100.0)
+        >>> mean = weighted_mean(image, near, window=3)
+        >>> print([f"{value:.2f}" for value in mean.ravel()])
+        ['2.00', '2.00', '6.00', '6.00']
+
+    Source: J. Kopf et al., "Joint bilateral upsampling", 2007; T.-M. Li et al.,
+    "SURE-based optimization for adaptive sampling and reconstruction", 2012 (the noisy
+    guide); ED eq. 32-34.
+    """
+    if not sigma > 0:
+        raise ValueError(f"sigma must be positive, got {sigma}")
+    if noisy.shape != variance.shape:
+        raise ValueError(f"variance has shape {variance.shape}, noisy {noisy.shape}")
+    place = np.moveaxis(np.indices(guide.shape[:2]), 0, -1) / (2**0.5 * sigma)
+    exact = jnp.concatenate([jnp.asarray(place, guide.dtype), guide], axis=-1)
+    parts = np.cumsum([exact.shape[-1], noisy.shape[-1]])
+
+    def pair(p: Pairs, q: Pairs) -> Array:
+        (g_p, z_p, v_p), (g_q, z_q, v_q) = jnp.split(p, parts), jnp.split(q, parts)
+        far = _square_distance(g_p, g_q)
+        for one, other, v, w in zip(z_p, z_q, v_p, v_q, strict=True):
+            square, noise = jnp.square(one - other), v + w
+            known = _FARTHEST * noise > square
+            most = jnp.where(square > 0, _FARTHEST, jnp.zeros_like(square))
+            far += divide(square, noise, where=known, otherwise=most)
+        return jnp.exp(-far)
+
+    return Weights(jnp.concatenate([exact, noisy, variance], axis=-1), pair)
+
+
 def least_of(first: Weights, second: Weights) -> Weights:
     """The lesser of two weights: pixels must be alike in both ways.
 
@@ -169,18 +240,18 @@ def least_of(first: Weights, second: Weights) -> Weights:
     check_same_shape(first=first.image[..., :1], second=second.image[..., :1])
     split, halo = first.image.shape[-1], max(first.halo, second.halo)
 
-    def inner(planes: Planes, own: int) -> Planes:
+    def inner(planes: Pairs, own: int) -> Pairs:
         """Without what lies farther out than one of them wants."""
-        cut = slice(halo - own, planes.shape[1] - (halo - own))
-        return planes[:, cut, cut]
+        rows, columns = (slice(halo - own, n - (halo - own)) for n in planes.shape[1:3])
+        return planes[:, rows, columns]
 
-    def function(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-        one = first.function(inner(planes[:split], first.halo), grid)
-        other = second.function(inner(planes[split:], second.halo), grid)
+    def pair(p: Pairs, q: Pairs) -> Array:
+        one = first.pair(*(inner(i[:split], first.halo) for i in (p, q)))
+        other = second.pair(*(inner(i[split:], second.halo) for i in (p, q)))
         return jnp.minimum(one, other)
 
     image = jnp.concatenate([first.image, second.image], axis=-1)
-    return Weights(image, function, halo)
+    return Weights(image, pair, halo)
 
 
 def weighted_mean(
@@ -207,53 +278,107 @@ def weighted_mean(
         [2.  4.  5.5]
     """
     valid = finite(image, weights.image)
-    reach = check_window(window) // 2
-    grid = Grid(_TILE, 1, reach, _TILES)
+    reach, halo = check_window(window) // 2, weights.halo
+    tile = min(_TILE, max(image.shape[:2]))
+    grid = Grid(tile, 1, reach, _TILES)
+    wide = tile + 2 * halo
 
     def region(planes: Float[Array, "h w _"], reach: int) -> Region:
         return Region(jnp.moveaxis(jnp.where(valid, planes, 0.0), -1, 0), reach)
 
     def mean(near: Planes, seen: Planes) -> Planes:
         """Sums over the windows of a tile: of the image and of the weights."""
-        w = jnp.where(grid.inside, weights.function(seen, grid), 0.0)
-        total = jnp.einsum("kn,mn->km", flat(near), w, precision="highest")
-        return total.reshape(-1, _TILE, _TILE)
+        centre = seen[:, reach : reach + wide, reach : reach + wide]
+
+        def add_row(total: Planes, moved: list[Planes]) -> Planes:
+            near, seen = moved
+            for dx in range(window):
+                w = weights.pair(centre, seen[:, :wide, dx : dx + wide])
+                total = total + w[None] * near[:, :tile, dx : dx + tile]
+            return total
+
+        start = jnp.zeros((len(near), tile, tile), near.dtype)
+        return fold_rows(add_row, start, [near, seen], window)
 
     taken = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
-    regions = [region(taken, reach), region(weights.image, reach + weights.halo)]
+    regions = [region(taken, reach), region(weights.image, reach + halo)]
     sums = jnp.moveaxis(sum_over_tiles(mean, regions, grid, reach=0), 0, -1)
     weight = jnp.broadcast_to(sums[..., -1:], image.shape)
     result = divide(sums[..., :-1], weight, where=weight > 0)
     return jnp.where(valid, result, first_finite(image))
 
 
-def _gaussian(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """exp(-|p_i - p_c|^2)."""
-    return jnp.exp(-_square_distance(planes, grid))
+def tile_weights(weights: Weights, planes: Planes, grid: Grid) -> Float[Array, "m n"]:
+    """The weights of all pixels of a tile's neighbourhood for each centre.
+
+    Args:
+        weights: of pairs.
+        planes: of `weights.image`, the neighbourhood and the halo around it, [K,n,n].
+        grid: of the centres.
+
+    Returns:
+        the weights [M,N], of any value outside the windows.
+
+    Example:
+        >>> alike = gaussian_weights(jnp.array([0.0, 1.0, 1.0]).reshape(1, 3, 1), 1.0)
+        >>> planes = jnp.tile(alike.image[..., 0], (3, 1))[None]
+        >>> grid = Grid(side=1, stride=1, reach=1, batch=1)
+        >>> print(tile_weights(alike, planes, grid).reshape(3, 3).round(2))
+        [[0.37 1.   1.  ]
+         [0.37 1.   1.  ]
+         [0.37 1.   1.  ]]
+    """
+    if weights.halo == 0:
+        return weights.pair(grid.centres(planes)[:, :, None], flat(planes)[:, None])
+    offsets, inner = 2 * grid.reach + 1, grid.step + 2 * weights.halo
+    middle = slice(grid.reach, grid.reach + inner)
+    centre = planes[:, middle, middle, None]
+    moved = jnp.stack([planes[:, :, k : k + inner] for k in range(offsets)], axis=-1)
+    rows = [weights.pair(centre, moved[:, k : k + inner]) for k in range(offsets)]
+    w = _place(jnp.stack(rows))  # [offset row, row, column, near column]
+    w = _place(jnp.transpose(w, (2, 3, 1, 0)))  # [column, near column, row, near row]
+    w = jnp.transpose(w, (2, 0, 3, 1)).reshape(grid.step**2, -1)
+    rows, columns = grid.places
+    return w[rows * grid.step + columns]
 
 
-def _gaussian_of_both(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
+def _place(w: Float[Array, "a b t o"]) -> Float[Array, "a b t n"]:
+    """From offsets [.., t, o] to places [.., t, t + o], 0 elsewhere.
+
+    Row t is to be moved t places to the right: in memory that is one place more for
+    each row, which is what a row longer by one does.
+    """
+    *outer, count, offsets = w.shape
+    n = count + offsets - 1
+    longer = jnp.pad(w, [(0, 0)] * (w.ndim - 1) + [(0, count)])
+    flat = longer.reshape(*outer, count * (n + 1))
+    return flat[..., : count * n].reshape(*outer, count, n)
+
+
+def _gaussian(p: Pairs, q: Pairs) -> Array:
+    """exp(-|p - q|^2)."""
+    return jnp.exp(-_square_distance(p, q))
+
+
+def _gaussian_of_both(p: Pairs, q: Pairs) -> Array:
     """The same with the mean of both pixels' bandwidths, the last plane."""
-    square = _square_distance(planes[:-1], grid)
-    return jnp.exp(-square / _mean_of_both(planes[-1:], grid))
+    square = _square_distance(p[:-1], q[:-1])
+    return jnp.exp(-square / _mean_of_both(p[-1], q[-1]))
 
 
-def _mean_of_both(plane: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """Mean of each centre's and each pixel's value, [1,n,n]; positive."""
-    positive = jnp.where(plane > 0, plane, 1.0)
-    (near,), (centre,) = flat(positive), grid.centres(positive)
-    return (near[None] + centre[:, None]) / 2
+def _mean_of_both(p: Array, q: Array) -> Array:
+    """Mean of each pair's values; positive."""
+    p, q = (jnp.where(i > 0, i, 1.0) for i in (p, q))
+    return (p + q) / 2
 
 
-def _of_features(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """exp(-max (f_i - f_c)^2 / s_c): features, then their s, which is above zero."""
-    f, s = jnp.split(planes, 2)
-    near, centre, scale = flat(f), grid.centres(f), grid.centres(s)
+def _of_features(p: Pairs, q: Pairs) -> Array:
+    """exp(-max (f_p - f_q)^2 / s_p): features, then their s, which is above zero."""
+    (f_p, scale), (f_q, _) = jnp.split(p, 2), jnp.split(q, 2)
     scale = jnp.where(scale > 0, scale, 1.0)  # 0 outside the image
-    far = jnp.zeros((centre.shape[1], near.shape[1]), planes.dtype)
-    for f_i, f_c, s_c in zip(near, centre, scale, strict=True):
-        far = jnp.maximum(far, jnp.square(f_i[None] - f_c[:, None]) / s_c[:, None])
-    return jnp.exp(-far)
+    pairs = zip(f_p, f_q, scale, strict=True)
+    far = [jnp.square(one - other) / s for one, other, s in pairs]
+    return jnp.exp(-functools.reduce(jnp.maximum, far))
 
 
 def _square_slope(features: Float[Array, "h w f"], axis: int) -> Float[Array, "h w f"]:
@@ -268,8 +393,11 @@ def _square_slope(features: Float[Array, "h w f"], axis: int) -> Float[Array, "h
     return jnp.square(difference / 2)
 
 
-def _square_distance(planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """|p_i - p_c|^2; not expanded into products, which would cancel."""
-    pairs = zip(flat(planes), grid.centres(planes), strict=True)
-    zero = jnp.zeros((), planes.dtype)
-    return sum((jnp.square(near[None] - c[:, None]) for near, c in pairs), start=zero)
+def _square_distance(p: Pairs, q: Pairs) -> Array:
+    """|p - q|^2; not expanded into products, which would cancel.
+
+    Plane by plane: a sum over an axis would not be vectorised.
+    """
+    zero = jnp.zeros((), p.dtype)
+    pairs = zip(p, q, strict=True)
+    return sum((jnp.square(one - other) for one, other in pairs), start=zero)

@@ -1,0 +1,48 @@
+"""Medians against numpy's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from jscomb.numerics.medians import median, median_of
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@given(data=st.data())
+def test_the_median_is_that_of_the_valid_values(kind, data):
+    width = 8 * np.dtype(kind).itemsize
+    # XLA takes numbers below the normal ones for 0.
+    floats = st.floats(0, 2.0**100, width=width, allow_subnormal=False)
+    values = data.draw(arrays.arrays(kind, (3, 4, 1), elements=floats))
+    valid = data.draw(arrays.arrays(bool, values.shape))
+    broken = jnp.asarray(np.where(valid, values, np.nan))
+    expected = np.median(values[valid]) if valid.any() else 0
+    found = jax.jit(median)(broken, jnp.asarray(valid))
+    assert found.dtype == kind
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [10, 11])
+def test_the_derivative_is_that_of_the_values_in_the_middle(count):
+    values = jnp.asarray(RNG.uniform(0, 1, count))
+    gradient = jax.grad(median)(values, jnp.ones(count, bool))
+    np.testing.assert_allclose(gradient, jax.grad(jnp.median)(values))
+
+
+def test_equal_values_share_the_derivative():
+    values = jnp.array([0.0, 2.0, 2.0, 9.0, jnp.inf])
+    gradient = jax.grad(median)(values, jnp.isfinite(values))
+    np.testing.assert_allclose(gradient, [0, 0.5, 0.5, 0, 0])
+
+
+@pytest.mark.parametrize("count", range(1, 8))
+def test_the_median_of_images(count):
+    images = RNG.normal(size=(count, 50, 3)).round(1)
+    found = median_of(jnp.asarray(images))
+    np.testing.assert_allclose(found, np.median(images, axis=0), rtol=1e-15)
