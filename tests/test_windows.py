@@ -13,7 +13,7 @@ from jax.test_util import check_grads
 from jscomb.numerics import kernels, windows
 
 SHAPES = [(1, 1, 1), (1, 7, 2), (6, 1, 1), (5, 8, 3), (20, 9, 1)]
-WINDOWS = [1, 3, 5, 7, 15, 21]
+WINDOWS = [1, 3, 5, 7, 15, 21, 25]
 
 
 def near(y, x, shape, window):
@@ -182,6 +182,15 @@ def test_transforms_agree(function):
     mapped = jax.jit(jax.vmap(lambda i: function(i, 3)))(batch)
     np.testing.assert_allclose(mapped, eager, rtol=1e-12, atol=1e-14)
     check_grads(jax.jit(lambda i: function(i, 3)), (batch[0],), order=1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("window", [5, 21, 25])
+def test_a_sum_is_its_own_derivative(window):
+    image, weights = (jnp.asarray(images((9, 30, 2), seed)) for seed in (3, 4))
+    total = lambda image: jnp.sum(windows.window_sum(image, window) * weights)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(total))(image), windows.window_sum(weights, window), atol=1e-12
+    )
 
 
 SHARDED = """

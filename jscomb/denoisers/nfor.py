@@ -19,6 +19,7 @@ Sources:
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.denoisers import nonlocal_means
@@ -31,6 +32,7 @@ from jscomb.numerics.windows import window_mean, window_sum
 from jscomb.typing import Image, Variance
 
 Features = Float[Array, "h w f"]
+Halves = Float[Array, "2 h w c"]
 
 _POOL = 3  # width that sample variances are averaged over: as they are they mislead
 _FEATURE_WINDOW, _FEATURE_STRENGTH = 11, 1.0  # of the features' pre-filter
@@ -98,31 +100,34 @@ def denoise(
         variance_b=variance_b,
     )
 
-    def fit(x: Image, guide: Image, v: Variance, f: Features, strength: float) -> Image:
-        weights = nonlocal_means.weights(
-            guide, window_mean(v, _POOL, mask=finite(v)), patch=patch, strength=strength
-        )
-        prediction, weight = joint_local_linear(
-            [(x, weights)], f, window=window, stride=stride, ridge=ridge
-        )
-        return jnp.where(weight > 0, prediction, first_finite(x, guide))
+    def fit(half: tuple[Image, Image, Variance, Features]) -> list[Image]:
+        """With either strength."""
+        x, guide, v, f = half
+        noise = window_mean(v, _POOL, mask=finite(v))
+        fits = []
+        for strength in strengths:
+            weights = nonlocal_means.weights(
+                guide, noise, patch=patch, strength=strength
+            )
+            prediction, weight = joint_local_linear(
+                [(x, weights)], f, window=window, stride=stride, ridge=ridge
+            )
+            fits.append(jnp.where(weight > 0, prediction, first_finite(x, guide)))
+        return fits
 
-    narrow, wide = (
-        (
-            fit(unbiased_a, unbiased_b, variance_b, features_b, strength),
-            fit(unbiased_b, unbiased_a, variance_a, features_a, strength),
-        )
-        for strength in strengths
-    )
-    share = _narrow_share(narrow, wide, (unbiased_b, unbiased_a), mixing)
-    a, b = (w + share * (n - w) for n, w in zip(narrow, wide, strict=True))
+    # One half after the other, by a program that is compiled once.
+    x, v = jnp.stack([unbiased_a, unbiased_b]), jnp.stack([variance_a, variance_b])
+    features = jnp.stack([features_b, features_a])
+    narrow, wide = lax.map(fit, (x, x[::-1], v[::-1], features))
+    share = _narrow_share(narrow, wide, x[::-1], mixing)
+    a, b = wide + share[None] * (narrow - wide)
     return a, b
 
 
 def _narrow_share(
-    narrow: tuple[Image, Image],
-    wide: tuple[Image, Image],
-    truth: tuple[Image, Image],
+    narrow: Halves,
+    wide: Halves,
+    truth: Halves,
     window: int,
 ) -> Float[Array, "h w 1"]:
     """The share s of the narrow fit with the least sum of (wide + s (n - w) - x)^2.

@@ -11,7 +11,8 @@ the same weights. Running differences (integral images) are never used: one fire
 doubling (sums over 1, 2, 4, ... pixels, put together by the bits of w), the fastest
 form on a CPU; rows by
 `lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
-(two collective permutes, where doubling needs twelve). Extrema double along both axes:
+(two collective permutes, where doubling needs twelve); for wide windows twice, which
+takes less work. Extrema double along both axes:
 `reduce_window` is many times slower on a CPU. Gaussian weights have no such form, nor
 have those of `kernels`, which differ from pixel to pixel: sharded by rows they exchange
 pixels once for every row of the window.
@@ -20,6 +21,7 @@ A `mask` names the pixels that take part; what the others hold is never looked a
 may be NaN.
 """
 
+import math
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -29,6 +31,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jscomb.numerics.guards import divide
 from jscomb.typing import Image, Mask
+
+_FEW = 15  # rows that are added in one step
 
 
 def window_sum(image: Image, window: int, *, mask: Mask | None = None) -> Image:
@@ -53,9 +57,7 @@ def window_sum(image: Image, window: int, *, mask: Mask | None = None) -> Image:
     """
     image = _only(image, mask, 0.0)
     columns = _add_columns(image, check_window(window))
-    # A concrete initial value, else jit loses the reverse derivative.
-    start = np.zeros((), image.dtype)
-    return lax.reduce_window(columns, start, lax.add, (window, 1, 1), (1, 1, 1), "SAME")
+    return _add_rows(columns, window)
 
 
 def window_mean(
@@ -284,6 +286,29 @@ def _add_columns(image: Image, window: int) -> Image:
         span *= 2
     assert total is not None
     return total
+
+
+def _add_rows(image: Image, window: int) -> Image:
+    """Sum over the w rows about each pixel.
+
+    Many rows in two steps: of runs of m rows, and of q runs, m apart.
+    """
+    r, height = window // 2, image.shape[0]
+    # A concrete initial value, else jit loses the reverse derivative.
+    start = np.zeros((), image.dtype)
+
+    def rows(image: Array, count: int, ends: tuple[int, int], apart: int = 1) -> Array:
+        size, by, one = (count, 1, 1), (apart, 1, 1), (1, 1, 1)
+        padding = (ends, (0, 0), (0, 0))
+        return lax.reduce_window(image, start, lax.add, size, one, padding, None, by)
+
+    if window <= _FEW:
+        return rows(image, window, (r, r))
+    m = math.isqrt(window)
+    q, rest = divmod(window, m)
+    runs = rows(image, m, (r, r))
+    total = rows(runs, q, (0, 0), m)[:height]
+    return total + rows(image, rest, (r, r))[-height:] if rest else total
 
 
 def _extremum(image: Image, window: int, pick: Callable, neutral: float) -> Image:
