@@ -217,11 +217,11 @@ def combiners() -> dict[str, Entry]:
     }
 
 
-def denoisers(*, window: int = 51) -> dict[str, Entry]:
+def denoisers(*, window: int | None = None) -> dict[str, Entry]:
     """All functions that make a biased image.
 
     Args:
-        window: width of the regressions' windows in pixels, odd.
+        window: width of their windows in pixels, odd; None for what each has by itself.
 
     Returns:
         as `combiners`.
@@ -230,20 +230,30 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
     guided = lambda r: (r.unbiased, r.biased, r.variance)
     halves = lambda r: (r.unbiased_a, r.unbiased_b)
     seven = lambda r: r.features[..., :7]
-    far = 2 * (window // 2)  # a pixel's fits, and the fits' pixels
+    near = window or 21
+    wide = window or 51
+    far = 2 * (wide // 2)  # a pixel's fits, and the fits' pixels
     # Priors say by what is not finite where nothing is known.
     found = {
         "bilateral.denoise": Entry(
-            lambda r: bilateral.denoise(r.unbiased, r.variance, r.features), 10 + 1
+            lambda r: bilateral.denoise(
+                r.unbiased, r.variance, r.features, window=near
+            ),
+            near // 2 + 1,
         ),
         "nonlocal_means.denoise": Entry(
-            lambda r: nonlocal_means.denoise(*guided(r)), 10 + 3
+            lambda r: nonlocal_means.denoise(*guided(r), window=near), near // 2 + 3
         ),
-        "rdfc.denoise": Entry(lambda r: rdfc.denoise(*guided(r), r.features), 10 + 3),
+        "rdfc.denoise": Entry(
+            lambda r: rdfc.denoise(*guided(r), r.features, window=near), near // 2 + 3
+        ),
         "nfor.denoise": Entry(
             lambda r: jnp.concatenate(
                 nfor.denoise(
-                    *halves(r), r.variance, r.variance, r.features, r.features
+                    *halves(r),
+                    *2 * [r.variance],
+                    *2 * [r.features],
+                    window=window or 19,
                 ),
                 axis=-1,
             )
@@ -261,7 +271,7 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
             _at_one(
                 lambda r: jnp.concatenate(
                     james_stein.cross_regression(
-                        *r[:4], r.features, r.features, kappa=0.01, window=window
+                        *r[:4], r.features, r.features, kappa=0.01, window=wide
                     ),
                     axis=-1,
                 )
@@ -272,7 +282,7 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
             _at_one(
                 lambda r: first_finite(
                     double_shrinkage.radiance_prior(
-                        *guided(r)[:2], r.grey, r.grey / 4, r.features, window=window
+                        *guided(r)[:2], r.grey, r.grey / 4, r.features, window=wide
                     )
                 )
             ),
@@ -282,7 +292,7 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
             _at_one(
                 lambda r: first_finite(
                     double_shrinkage.blend_prior(
-                        r.biased, r.grey, r.features, window=window
+                        r.biased, r.grey, r.features, window=wide
                     )
                 )
             ),
@@ -296,20 +306,21 @@ def denoisers(*, window: int = 51) -> dict[str, Entry]:
     return found
 
 
-def solvers(*, window: int = 51) -> dict[str, Entry]:
+def solvers(*, window: int | None = None) -> dict[str, Entry]:
     """All that solve something at each pixel, or for the frame.
 
     Args:
-        window: width of the regressions' windows in pixels, odd.
+        window: width of the regressions' windows in pixels, odd; None for their own.
 
     Returns:
         as `combiners`.
     """
-    far = 2 * (window // 2)
+    wide = window or 51
+    far = 2 * (wide // 2)
 
     def regressed(r: Rendering) -> Image:
         prediction, weight = regression.local_linear(
-            r.unbiased, r.biased, r.features, 0.1, window=window
+            r.unbiased, r.biased, r.features, 0.1, window=wide
         )
         return jnp.where(weight > 0, prediction, 0.0)
 
@@ -317,7 +328,7 @@ def solvers(*, window: int = 51) -> dict[str, Entry]:
         weights = noise_free_weights(r.biased, r.grey, epsilon=0.01)
         targets = [(r.unbiased_a, weights), (r.unbiased_b, weights)]
         prediction, weight = regression.joint_local_linear(
-            targets, r.features, window=window
+            targets, r.features, window=wide
         )
         return jnp.where(weight > 0, prediction, 0.0)
 

@@ -29,6 +29,16 @@ _TESTS = itertools.count()
 _STATES: dict[str, dict] = {}
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Tests of a file share programs: one process runs them, with --dist loadgroup."""
+    for item in items:
+        if item.path.parent == DATA.parent and not item.get_closest_marker(
+            "xdist_group"
+        ):
+            item.add_marker(pytest.mark.xdist_group(item.path.name))
+
+
 @pytest.fixture(autouse=True)
 def same_numbers(request):
     """What a module's `RNG` draws does not depend on which of its tests ran before."""

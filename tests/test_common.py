@@ -1,6 +1,5 @@
 """What every public combiner, denoiser and solver promises, whatever its paper."""
 
-import functools
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -34,9 +33,7 @@ from jscomb.denoisers import (
 from jscomb.numerics import poisson, regression, simplex, sure, tiles
 
 ENTRIES = (
-    catalogue.combiners()
-    | catalogue.denoisers(window=11)
-    | catalogue.solvers(window=11)
+    catalogue.combiners() | catalogue.denoisers(window=7) | catalogue.solvers(window=7)
 )
 
 
@@ -59,7 +56,6 @@ class Compiled(NamedTuple):
     everything: Callable[[Rendering], tuple[jax.Array, Any]]
 
 
-@functools.cache
 def compiled(name: str) -> Compiled:
     """The entry of that name."""
     entry = ENTRIES[name]
@@ -83,7 +79,12 @@ def compiled(name: str) -> Compiled:
     return Compiled(entry, *map(jax.jit, (entry.function, mapped, tiled, everything)))
 
 
-@pytest.fixture(params=ENTRIES)
+def in_one_process(names):
+    """Parameters; all tests of a function are run in a row where it is compiled."""
+    return [pytest.param(i, marks=pytest.mark.xdist_group(i)) for i in names]
+
+
+@pytest.fixture(scope="module", params=in_one_process(ENTRIES))
 def function(request):
     """One of them."""
     return compiled(request.param)
@@ -124,19 +125,21 @@ def test_pure(function, plain):
     assert function.result._cache_size() == programs
 
 
-@pytest.mark.parametrize("name", catalogue.combiners())
-def test_eager_is_compiled(name, plain):
+@pytest.mark.parametrize(
+    "function", in_one_process(catalogue.combiners()), indirect=True
+)
+def test_eager_is_compiled(function, plain):
     """On an image smaller than the windows.
 
     Denoisers and solvers are loops, and those are compiled either way.
     """
-    function, small = compiled(name), cut(plain, 4, 5)
+    small = cut(plain, 4, 5)
     eager, jitted = function.entry.function(small), function.result(small)
     assert_close(eager, jitted, 10 * function.entry.rounding)
 
 
 def test_vmap_is_a_loop(function, plain):
-    crop = cut(plain, 16, 12)
+    crop = cut(plain, 4, 5)
     batch = [crop, crop.scaled(jnp.float32(0.5)), jax.tree.map(jnp.flip, crop)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
     for got, each in zip(function.mapped(stacked), batch, strict=True):

@@ -29,9 +29,10 @@ from jscomb.frame import Biased, Frame
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
 from jscomb.numerics.regression import joint_local_linear
 from jscomb.numerics.windows import window_mean, window_sum
-from jscomb.typing import Image, Variance
+from jscomb.typing import Image, Scalar, Variance
 
 Features = Float[Array, "h w f"]
+# Of both halves, or with both strengths.
 Halves = Float[Array, "2 h w c"]
 
 _POOL = 3  # width that sample variances are averaged over: as they are they mislead
@@ -100,25 +101,29 @@ def denoise(
         variance_b=variance_b,
     )
 
-    def fit(half: tuple[Image, Image, Variance, Features]) -> list[Image]:
+    def fit(half: tuple[Image, Image, Variance, Features]) -> Halves:
         """With either strength."""
         x, guide, v, f = half
         noise = window_mean(v, _POOL, mask=finite(v))
-        fits = []
-        for strength in strengths:
+
+        def one(strength: Scalar) -> Image:
             weights = nonlocal_means.weights(
                 guide, noise, patch=patch, strength=strength
             )
             prediction, weight = joint_local_linear(
                 [(x, weights)], f, window=window, stride=stride, ridge=ridge
             )
-            fits.append(jnp.where(weight > 0, prediction, first_finite(x, guide)))
-        return fits
+            return jnp.where(weight > 0, prediction, first_finite(x, guide))
 
-    # One half after the other, by a program that is compiled once.
+        return lax.map(one, jnp.asarray(strengths, x.dtype))
+
+    if not min(strengths) > 0:
+        raise ValueError(f"strengths must be positive, got {strengths}")
+    # One after the other, by a program that is compiled once.
     x, v = jnp.stack([unbiased_a, unbiased_b]), jnp.stack([variance_a, variance_b])
     features = jnp.stack([features_b, features_a])
-    narrow, wide = lax.map(fit, (x, x[::-1], v[::-1], features))
+    fits = lax.map(fit, (x, x[::-1], v[::-1], features))
+    narrow, wide = jnp.moveaxis(fits, 1, 0)
     share = _narrow_share(narrow, wide, x[::-1], mixing)
     a, b = wide + share[None] * (narrow - wide)
     return a, b

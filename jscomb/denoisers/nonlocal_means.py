@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from jscomb.numerics.guards import check_same_shape, divide, finite
 from jscomb.numerics.weights import Pairs, Weights, weighted_mean
 from jscomb.numerics.windows import check_window
-from jscomb.typing import Image
+from jscomb.typing import Image, Scalar
 
 # A single pixel's distance at most: finite where the variance is 0, yet enough to keep
 # two patches apart that differ in one channel of one pixel.
@@ -43,7 +43,7 @@ def denoise(
     *,
     window: int = 21,
     patch: int = 7,
-    strength: float = 0.5,
+    strength: Scalar | float = 0.5,
 ) -> Image:
     """Replace each pixel by the mean of those that look the same in the guide.
 
@@ -63,7 +63,7 @@ def denoise(
 
     Raises:
         ValueError: while tracing, if shapes differ, a width is even or `strength` is
-            not positive.
+            a number that is not positive.
 
     Example:
         >>> image = jnp.array([0.9, 1.1, 4.9, 5.1]).reshape(1, 4, 1)
@@ -83,7 +83,7 @@ def weights(
     variance: Float[Array, "h w g"],
     *,
     patch: int = 7,
-    strength: float = 0.5,
+    strength: Scalar | float = 0.5,
 ) -> Weights:
     """Weights w_pq for a regression, or any other weighted mean.
 
@@ -98,7 +98,7 @@ def weights(
 
     Raises:
         ValueError: while tracing, if shapes differ, `patch` is even or `strength` is
-            not positive.
+            a number that is not positive.
 
     Example:
         >>> from jscomb.numerics.weights import weighted_mean
@@ -112,7 +112,7 @@ def weights(
     Source: Rousselle et al. 2013.
     """
     check_same_shape(guide=guide, variance=variance)
-    if not strength > 0:
+    if isinstance(strength, int | float) and not strength > 0:
         raise ValueError(f"strength must be positive, got {strength}")
     halo = check_window(patch) // 2
     valid = finite(guide, variance).astype(guide.dtype)
@@ -122,7 +122,7 @@ def weights(
     return Weights(image, functools.partial(_alike, patch, strength), halo)
 
 
-def _alike(patch: int, strength: float, p: Pairs, q: Pairs) -> Array:
+def _alike(patch: int, strength: Scalar | float, p: Pairs, q: Pairs) -> Array:
     """The weights of pairs of pixels; those `patch // 2` from the border have none."""
     distance, known = _distance(p, q, strength)
     total, count = (_patch_sum(i, patch) for i in (distance, known))
@@ -130,7 +130,7 @@ def _alike(patch: int, strength: float, p: Pairs, q: Pairs) -> Array:
     return jnp.exp(-jnp.maximum(mean, 0.0))
 
 
-def _distance(p: Pairs, q: Pairs, strength: float) -> tuple[Array, Array]:
+def _distance(p: Pairs, q: Pairs, strength: Scalar | float) -> tuple[Array, Array]:
     """d2 of each pair, mean over the channels, and 1 where both are valid, else 0."""
     channels = len(p) // 2
     known = p[-1] * q[-1]
