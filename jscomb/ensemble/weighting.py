@@ -5,6 +5,7 @@ from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jscomb.ensemble.errors import SCALES, Bases, check_bases, error_matrix
 from jscomb.numerics import simplex
@@ -12,6 +13,7 @@ from jscomb.numerics.guards import check_same_shape, finite, first_finite
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.typing import Image, Key, Variance
 
+Guide = Float[Array, "h w _"]
 Solver = Literal["hull", "iterative", "reference", "multi-scale"]
 
 
@@ -24,8 +26,8 @@ def combine(
     *,
     solver: Solver = "hull",
     filter: bool = True,
-    albedo: Image | None = None,
-    normal: Image | None = None,
+    albedo: Guide | None = None,
+    normal: Guide | None = None,
     solver_key: Key | None = None,
     windows: Sequence[int] = SCALES,
     shared: bool = True,
@@ -166,8 +168,8 @@ def filter_weights(
     combined: Image,
     variance: Variance,
     *,
-    albedo: Image | None = None,
-    normal: Image | None = None,
+    albedo: Guide | None = None,
+    normal: Guide | None = None,
     radius: int = 7,
     sigma: float = 3.0,
     sigma_radiance: float = 2.0,
