@@ -1,51 +1,20 @@
-"""How alike two pixels are, as the weight of one in the other's window.
+"""Kinds of weights: how alike two pixels are.
 
-A weight is a function of pairs of pixels. A mean over windows walks the window and
-holds one weight a pixel at a time; a regression wants all weights of a tile at once, as
-a matrix. `denoisers.nonlocal_means` has another kind.
+`denoisers.nonlocal_means` has another kind.
 """
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
-from jscomb.numerics.tiles import (
-    Grid,
-    Planes,
-    Region,
-    flat,
-    fold_rows,
-    sum_over_tiles,
-)
-from jscomb.numerics.windows import check_window
+from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.weights.pairs import Pairs, Weights
 from jscomb.typing import Scalar
 
 # A noisy guide's distance beyond which a weight is 0 in any precision.
 _FARTHEST = 1e4
-_TILE, _TILES = 64, 2
-
-Pairs = Float[Array, "_ _ _ ..."]  # planes of pixels, one of each pair
-
-
-class Weights(NamedTuple):
-    """How each window weighs its pixels.
-
-    Attributes:
-        image: what the weights are made from, [H,W,K].
-        pair: planes of the windows' centres and of pixels in them, [K,h,w,...], to the
-            pairs' weights [h,w,...], finite and at least zero whatever the planes hold.
-        halo: pixels on every side of [h,w] that a weight depends on and that have none
-            themselves; with 0 the pairs need not be neighbours.
-    """
-
-    image: Float[Array, "h w k"]
-    pair: Callable[[Pairs, Pairs], Array]
-    halo: int = 0
 
 
 def gaussian_weights(
@@ -66,6 +35,7 @@ def gaussian_weights(
             not [H,W,1].
 
     Example:
+        >>> from jscomb.numerics.weights import weighted_mean
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
         >>> guide = jnp.array([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
         >>> mean = weighted_mean(image, gaussian_weights(guide, 0.01), window=3)
@@ -108,6 +78,7 @@ def noise_free_weights(
         ValueError: if the variance's shape is not [H,W,1].
 
     Example:
+        >>> from jscomb.numerics.weights import weighted_mean
         >>> image = jnp.array([1.0, 3.0]).reshape(1, 2, 1)
         >>> variance = jnp.array([0.0, 1.0]).reshape(1, 2, 1)
         >>> noisy = noise_free_weights(0 * image, variance, epsilon=1e-3)
@@ -145,6 +116,7 @@ def feature_weights(
         ValueError: if `strength` or `least` is not positive.
 
     Example:
+        >>> from jscomb.numerics.weights import weighted_mean
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
         >>> albedo = jnp.array([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
         >>> mean = weighted_mean(image, feature_weights(albedo), window=3)
@@ -185,6 +157,7 @@ def bilateral_weights(
         ValueError: if `sigma` is not positive, or noisy and variance differ in shape.
 
     Example:
+        >>> from jscomb.numerics.weights import weighted_mean
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
         >>> edge = jnp.array([0.0, 0.0, 9.0, 9.0]).reshape(1, 4, 1)
         >>> none = edge[..., :0]
@@ -201,21 +174,20 @@ def bilateral_weights(
         raise ValueError(f"sigma must be positive, got {sigma}")
     if noisy.shape != variance.shape:
         raise ValueError(f"variance has shape {variance.shape}, noisy {noisy.shape}")
-    place = np.moveaxis(np.indices(guide.shape[:2]), 0, -1) / (2**0.5 * sigma)
-    exact = jnp.concatenate([jnp.asarray(place, guide.dtype), guide], axis=-1)
-    parts = np.cumsum([exact.shape[-1], noisy.shape[-1]])
+    # Whole numbers, which float32 holds exactly; scaled, large ones would be rounded.
+    place = jnp.asarray(np.moveaxis(np.indices(guide.shape[:2]), 0, -1), guide.dtype)
+    parts = np.cumsum([2, guide.shape[-1], noisy.shape[-1]])
 
     def pair(p: Pairs, q: Pairs) -> Array:
-        (g_p, z_p, v_p), (g_q, z_q, v_q) = jnp.split(p, parts), jnp.split(q, parts)
-        far = _square_distance(g_p, g_q)
+        at_p, g_p, z_p, v_p = jnp.split(p, parts)
+        at_q, g_q, z_q, v_q = jnp.split(q, parts)
+        far = _square_distance(at_p, at_q) / (2 * sigma**2)
+        far += _square_distance(g_p, g_q)
         for one, other, v, w in zip(z_p, z_q, v_p, v_q, strict=True):
-            square, noise = jnp.square(one - other), v + w
-            known = _FARTHEST * noise > square
-            most = jnp.where(square > 0, _FARTHEST, jnp.zeros_like(square))
-            far += divide(square, noise, where=known, otherwise=most)
+            far += in_noise(jnp.square(one - other), v + w, most=_FARTHEST)
         return jnp.exp(-far)
 
-    return Weights(jnp.concatenate([exact, noisy, variance], axis=-1), pair)
+    return Weights(jnp.concatenate([place, guide, noisy, variance], axis=-1), pair)
 
 
 def least_of(first: Weights, second: Weights) -> Weights:
@@ -232,6 +204,7 @@ def least_of(first: Weights, second: Weights) -> Weights:
         ValueError: while tracing, if the sizes differ.
 
     Example:
+        >>> from jscomb.numerics.weights import weighted_mean
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
         >>> step = lambda at: gaussian_weights(jnp.where(image > at, 1.0, 0.0), 0.01)
         >>> print(weighted_mean(image, least_of(step(2), step(4)), window=3)[0, :, 0])
@@ -254,105 +227,25 @@ def least_of(first: Weights, second: Weights) -> Weights:
     return Weights(image, pair, halo)
 
 
-def weighted_mean(
-    image: Float[Array, "h w _"], weights: Weights, *, window: int
-) -> Float[Array, "h w _"]:
-    """Mean over the window of each pixel. Pure, and differentiable in every array.
+def in_noise(square: Array, noise: Array, *, most: float) -> Array:
+    """A squared distance in units of its noise.
 
     Args:
-        image: any unit, shape [H,W,C].
-        weights: of the pixels in the windows.
-        window: width in pixels, odd.
+        square: the squared distance; may be below zero, if less what the noise makes.
+        noise: its variance, at least zero, of the same shape and unit.
+        most: the largest result; what a distance without noise counts as.
 
     Returns:
-        the mean, shape [H,W,C]. Pixels that are not finite in image or weights take no
-        part; there the result is the image where it is finite, else 0.
-
-    Raises:
-        ValueError: while tracing, if the window is even.
+        their ratio.
 
     Example:
-        >>> image = jnp.array([1.0, 3.0, 8.0]).reshape(1, 3, 1)
-        >>> even = gaussian_weights(0 * image, 1.0)
-        >>> print(weighted_mean(image, even, window=3)[0, :, 0])
-        [2.  4.  5.5]
+        >>> square, noise = jnp.array([4.0, 4.0, 0.0]), jnp.array([2.0, 0.0, 0.0])
+        >>> print(in_noise(square, noise, most=9.0))
+        [2. 9. 0.]
     """
-    valid = finite(image, weights.image)
-    reach, halo = check_window(window) // 2, weights.halo
-    tile = min(_TILE, max(image.shape[:2]))
-    grid = Grid(tile, 1, reach, _TILES)
-    wide = tile + 2 * halo
-
-    def region(planes: Float[Array, "h w _"], reach: int) -> Region:
-        return Region(jnp.moveaxis(jnp.where(valid, planes, 0.0), -1, 0), reach)
-
-    def mean(near: Planes, seen: Planes) -> Planes:
-        """Sums over the windows of a tile: of the image and of the weights."""
-        centre = seen[:, reach : reach + wide, reach : reach + wide]
-
-        def add_row(total: Planes, moved: list[Planes]) -> Planes:
-            near, seen = moved
-            for dx in range(window):
-                w = weights.pair(centre, seen[:, :wide, dx : dx + wide])
-                total = total + w[None] * near[:, :tile, dx : dx + tile]
-            return total
-
-        start = jnp.zeros((len(near), tile, tile), near.dtype)
-        return fold_rows(add_row, start, [near, seen], window)
-
-    taken = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
-    regions = [region(taken, reach), region(weights.image, reach + halo)]
-    sums = jnp.moveaxis(sum_over_tiles(mean, regions, grid, reach=0), 0, -1)
-    weight = jnp.broadcast_to(sums[..., -1:], image.shape)
-    result = divide(sums[..., :-1], weight, where=weight > 0)
-    return jnp.where(valid, result, first_finite(image))
-
-
-def tile_weights(weights: Weights, planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """The weights of all pixels of a tile's neighbourhood for each centre.
-
-    Args:
-        weights: of pairs.
-        planes: of `weights.image`, the neighbourhood and the halo around it, [K,n,n].
-        grid: of the centres.
-
-    Returns:
-        the weights [M,N], of any value outside the windows.
-
-    Example:
-        >>> alike = gaussian_weights(jnp.array([0.0, 1.0, 1.0]).reshape(1, 3, 1), 1.0)
-        >>> planes = jnp.tile(alike.image[..., 0], (3, 1))[None]
-        >>> grid = Grid(side=1, stride=1, reach=1, batch=1)
-        >>> print(tile_weights(alike, planes, grid).reshape(3, 3).round(2))
-        [[0.37 1.   1.  ]
-         [0.37 1.   1.  ]
-         [0.37 1.   1.  ]]
-    """
-    if weights.halo == 0:
-        return weights.pair(grid.centres(planes)[:, :, None], flat(planes)[:, None])
-    offsets, inner = 2 * grid.reach + 1, grid.step + 2 * weights.halo
-    middle = slice(grid.reach, grid.reach + inner)
-    centre = planes[:, middle, middle, None]
-    moved = jnp.stack([planes[:, :, k : k + inner] for k in range(offsets)], axis=-1)
-    rows = [weights.pair(centre, moved[:, k : k + inner]) for k in range(offsets)]
-    w = _place(jnp.stack(rows))  # [offset row, row, column, near column]
-    w = _place(jnp.transpose(w, (2, 3, 1, 0)))  # [column, near column, row, near row]
-    w = jnp.transpose(w, (2, 0, 3, 1)).reshape(grid.step**2, -1)
-    rows, columns = grid.places
-    return w[rows * grid.step + columns]
-
-
-def _place(w: Float[Array, "a b t o"]) -> Float[Array, "a b t n"]:
-    """From offsets [.., t, o] to places [.., t, t + o], 0 elsewhere.
-
-    Row t is to be moved t places to the right: in memory that is one place more for
-    each row, which is what a row longer by one does.
-    """
-    *outer, count, offsets = w.shape
-    n = count + offsets - 1
-    longer = jnp.pad(w, [(0, 0)] * (w.ndim - 1) + [(0, count)])
-    flat = longer.reshape(*outer, count * (n + 1))
-    return flat[..., : count * n].reshape(*outer, count, n)
+    near = (most * noise > square) & (noise > 0)
+    far = jnp.where(square > 0, most, jnp.zeros_like(square))
+    return divide(square, noise, where=near, otherwise=far)
 
 
 def _gaussian(p: Pairs, q: Pairs) -> Array:
