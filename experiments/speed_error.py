@@ -34,7 +34,7 @@ from jscomb import james_stein
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import regression
-from jscomb.numerics.weights import gaussian_weights
+from jscomb.numerics.weights import gaussian_weights, tile_weights
 from jscomb.typing import Image
 
 WINDOW, FEATURES, CHANNELS = 51, 11, 3
@@ -96,8 +96,8 @@ def parts(size: int) -> dict[str, Callable]:
 
     def weigh(guide: jax.Array) -> jax.Array:
         side = int(np.sqrt(n))
-        weights_of = gaussian_weights(jnp.zeros((1, 1, 3)), 0.1).function
-        one = lambda g: weights_of(g.reshape(3, side, side), grid)
+        weights_of = gaussian_weights(jnp.zeros((1, 1, 3)), 0.1)
+        one = lambda g: tile_weights(weights_of, g.reshape(3, side, side), grid)
         return jnp.where(inside, jax.vmap(one)(guide), 0.0)
 
     fit = lambda stride: jax.jit(

@@ -10,6 +10,7 @@ import jaxtyping
 import matplotlib as mpl
 import numpy as np
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 from experiments import scenes
 from jscomb import cli, exr
@@ -29,14 +30,19 @@ _TESTS = itertools.count()
 _STATES: dict[str, dict] = {}
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """Tests of a file share programs: one process runs them, with --dist loadgroup."""
-    for item in items:
-        if item.path.parent == DATA.parent and not item.get_closest_marker(
-            "xdist_group"
-        ):
-            item.add_marker(pytest.mark.xdist_group(item.path.name))
+class SharedPrograms(LoadScopeScheduling):
+    """Tests that share programs run in one process, which compiles them once."""
+
+    def _split_scope(self, nodeid):
+        """A file; in the battery over all functions, what the parameters begin with."""
+        file, _, test = nodeid.partition("::")
+        parameters = test.partition("[")[2].partition("-")[0].rstrip("]")
+        return f"{file} {parameters}" if file.endswith("test_common.py") else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    return SharedPrograms(config, log)
 
 
 @pytest.fixture(autouse=True)

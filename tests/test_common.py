@@ -79,14 +79,9 @@ def compiled(name: str) -> Compiled:
     return Compiled(entry, *map(jax.jit, (entry.function, mapped, tiled, everything)))
 
 
-def in_one_process(names):
-    """Parameters; all tests of a function are run in a row where it is compiled."""
-    return [pytest.param(i, marks=pytest.mark.xdist_group(i)) for i in names]
-
-
-@pytest.fixture(scope="module", params=in_one_process(ENTRIES))
+@pytest.fixture(scope="module", params=ENTRIES)
 def function(request):
-    """One of them."""
+    """One of them, for all its tests in a row."""
     return compiled(request.param)
 
 
@@ -125,9 +120,7 @@ def test_pure(function, plain):
     assert function.result._cache_size() == programs
 
 
-@pytest.mark.parametrize(
-    "function", in_one_process(catalogue.combiners()), indirect=True
-)
+@pytest.mark.parametrize("function", catalogue.combiners(), indirect=True)
 def test_eager_is_compiled(function, plain):
     """On an image smaller than the windows.
 

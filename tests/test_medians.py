@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -14,6 +14,7 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
+@settings(deadline=None)  # the first example waits for the compiler
 @given(data=st.data())
 def test_the_median_is_that_of_the_valid_values(kind, data):
     width = 8 * np.dtype(kind).itemsize

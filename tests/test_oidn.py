@@ -95,12 +95,13 @@ def test_it_is_a_jax_function(glass_frame, denoised):
         x, albedo=frame.albedo, normal=frame.normal, exposure=frame.exposure
     )
     x = frame.color
-    np.testing.assert_allclose(jax.jit(run)(x), denoised.full, rtol=1e-6)
+    # Compiled, x / exposure is a product; the filter computes in half floats.
+    np.testing.assert_allclose(jax.jit(run)(x), denoised.full, rtol=2e-5)
     both = jax.jit(jax.vmap(run))(jnp.stack([x, x[::-1]]))
-    np.testing.assert_allclose(both[0], denoised.full, rtol=1e-6)
+    np.testing.assert_allclose(both[0], denoised.full, rtol=2e-5)
     derivative = jax.jit(lambda x, t: jax.jvp(run, (x,), (t,)))
     y, moved = derivative(x, x)
-    np.testing.assert_allclose(y, denoised.full, rtol=1e-6)
+    np.testing.assert_allclose(y, denoised.full, rtol=2e-5)
     # Scaling the image scales the result, but for the filter's own nonlinearity.
     assert rel_l2(moved, y) < 0.05
     for scale in (1e-4, 1e4):
