@@ -193,6 +193,20 @@ def test_the_filter_is_the_loops(size):
         assert np.isfinite(gradient).all()
 
 
+def test_the_filter_is_as_exact_far_from_the_origin():
+    """Where scaled coordinates would be rounded, in float32."""
+    image, guide = jnp.asarray(RNG.normal(size=(2, 3, 5000, 1)), jnp.float32)
+
+    @jax.jit
+    def filtered(image, guide):
+        alike = bilateral_weights(guide, guide, guide**2, sigma=0.7)
+        return weighted_mean(image, alike, window=5)
+
+    crop = filtered(image[:, -20:], guide[:, -20:])
+    far = filtered(image, guide)[:, -20:]
+    np.testing.assert_allclose(far[:, 2:], crop[:, 2:], atol=2e-6)
+
+
 def test_filtered_weights_stay_weights(glass_frame):
     color, albedo, normal = glass_frame.color, glass_frame.albedo, glass_frame.normal
     w = RNG.dirichlet(np.ones(3), color.shape)
