@@ -5,13 +5,13 @@ from collections.abc import Callable
 import jax
 
 from jscomb.denoisers import bilateral, nonlocal_means, of_parts, oidn, rdfc, smoothing
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 
 _means = jax.jit(nonlocal_means.denoise)
 _gaussian = jax.jit(smoothing.gaussian)
 
-BASES: dict[str, Callable[[Frame], Biased]] = {
-    "oidn": lambda frame: frame.biased.get("oidn") or oidn.denoise_frame(frame),
+BASES: dict[str, Callable[[Frame], Estimate]] = {
+    "oidn": lambda frame: frame.estimates.get("oidn") or oidn.denoise_frame(frame),
     "oidn, no features": lambda frame: oidn.denoise_frame(frame, features=False),
     "bilateral": bilateral.denoise_frame,
     "gaussian": lambda frame: of_parts(
@@ -24,7 +24,7 @@ BASES: dict[str, Callable[[Frame], Biased]] = {
 }
 
 
-def bases_of(frame: Frame) -> dict[str, Biased]:
+def bases_of(frame: Frame) -> dict[str, Estimate]:
     """The bases of a frame and of its halves, in the order of `BASES`.
 
     Args:
@@ -36,6 +36,6 @@ def bases_of(frame: Frame) -> dict[str, Biased]:
     return {name: make(frame) for name, make in BASES.items()}
 
 
-def unbiased_of(frame: Frame) -> Biased:
+def unbiased_of(frame: Frame) -> Estimate:
     """The unbiased image as one more base."""
     return of_parts(frame, lambda part: part.color, variance=False)

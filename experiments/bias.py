@@ -197,7 +197,7 @@ def rendered_groups(config: Config, name: str, skip: int = 0) -> Iterator[Group]
         depth=np.float32(aov[..., 6:7]),
     )
     combined = jax.jit(methods(guide, config.samples, config.window))
-    exposure = float(guide.exposure)
+    exposure = float(guide.median_luminance)
 
     def draws(launch: Callable, seeds: Iterator[int], count: int) -> Array:
         each = [

@@ -49,7 +49,7 @@ def _whitened(frame: Frame, scale: float, *, window: int) -> Image:
 def _dual(frame: Frame, scale: float) -> Image:
     """Each half's x with the other half's y, whitened."""
     a, b = frame.halves()
-    ya, yb = (half.biased["oidn"].full for half in (a, b))
+    ya, yb = (half.estimates["oidn"].image for half in (a, b))
     v = scale * james_stein.robust_variance(frame.variance)
     options = {"window": 7, "whiten": True}
     return james_stein.combine_dual(a.color, b.color, ya, yb, v, **options)
@@ -59,7 +59,7 @@ def _regressed(frame: Frame, *, stride: int, always: bool = False) -> Image:
     """Whitened, with y* where the halves say that it pays, or always."""
     key = jax.random.key(0)
     found = james_stein.regress(key, frame, "oidn", stride=stride, always=always)
-    return choice.UNTRAINED["whitened"](frame.color, found.biased.full, frame.variance)
+    return choice.UNTRAINED["whitened"](frame.color, found.estimate.image, frame.variance)
 
 
 def _sure(frame: Frame) -> tuple[Variance, Risk]:
@@ -104,7 +104,7 @@ def _by(frame: Frame, *, method: str) -> Image:
 
 def _y(frame: Frame) -> Image:
     """The denoised image."""
-    return frame.biased["oidn"].full
+    return frame.estimates["oidn"].image
 
 
 # Called with values: a loop inside would be compiled anew each time.
@@ -125,7 +125,7 @@ _FOUR = ("oidn", "oidn, no features", "bilateral", "rdfc")
 COMBINERS: dict[str, Combiner] = {
     "path tracing": Combiner(lambda frame, scale: frame.color, 0, traced=True),
     "oidn": Combiner(lambda frame, scale: _y(frame), 1, traced=True),
-    "nfor": Combiner(lambda frame: nfor.denoise_frame(frame, stride=2).full, 0),
+    "nfor": Combiner(lambda frame: nfor.denoise_frame(frame, stride=2).image, 0),
     **{
         f"james-stein {w}x{w}": Combiner(_of(_james_stein, window=w), 1, traced=True)
         for w in (7, 15, 31)

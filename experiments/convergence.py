@@ -60,7 +60,7 @@ def blurred(frame: Frame) -> Frame:
         the same frame otherwise.
     """
     box = of_parts(frame, lambda part: _box(part.color), variance=False)
-    return frame.with_biased("oidn", box)
+    return frame.with_estimate("oidn", box)
 
 
 _box = jax.jit(lambda image: smoothing.box(image, window=BOX))

@@ -179,7 +179,7 @@ def measure(frame: Frame) -> dict[str, float]:
     rest = x_a, x_b, frame.variance, frame.albedo, frame.normal
     bases = bases_of(frame)
     row = {"path tracing": error(frame.color)}
-    row |= {name: error(base.full) for name, base in bases.items()}
+    row |= {name: error(base.image) for name, base in bases.items()}
     some = ensemble.stack_bases(bases)
     more = ensemble.stack_bases(bases | {"x": unbiased_of(frame)})
 

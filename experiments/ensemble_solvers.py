@@ -81,7 +81,7 @@ def repeated(images: jax.Array, size: int) -> jax.Array:
 def problems(config: Config, size: int) -> list[jax.Array]:
     """y^a and y^b [8,size,size,3], x_a and x_b [size,size,3]."""
     frame = frames.load(config.folder / f"{config.frame}.npz", config.samples)
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.scaled(1 / frame.median_luminance)
     box = of_parts(frame, lambda part: smoothing.box(part.color), variance=False)
     more = {"x": unbiased_of(frame), "box": box}
     _, a, b = ensemble.stack_bases(bases_of(frame) | more)

@@ -118,7 +118,7 @@ def true_weights(full, a, b, x_a, x_b, truth):
 def measure(config: Config, scene: str) -> dict[str, float]:
     """Relative L2 by method, mean over the judged renderings."""
     frame = rendered(config, scene)
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.scaled(1 / frame.median_luminance)
     assert frame.reference is not None
     truth, noise = frame.reference
     every = renderings_of(frame)

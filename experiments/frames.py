@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jscomb.frame import CHANNELS, Biased, Frame, Reference, make_frame
+from jscomb.frame import CHANNELS, Estimate, Frame, Reference, make_frame
 
 
 def load(path: pathlib.Path, samples: int) -> Frame:
@@ -47,8 +47,8 @@ def load(path: pathlib.Path, samples: int) -> Frame:
             pair(f"color_{half}"),
             variance=pair(f"variance_{half}"),
             samples=samples,
-            biased={
-                "oidn": Biased(
+            estimates={
+                "oidn": Estimate(
                     jnp.asarray(data[f"full_oidn_{half}"]),
                     jnp.asarray(pair(f"oidn_{half}")),
                 )
@@ -122,7 +122,7 @@ def measured(
         if not missing:
             continue
         frame = load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frame.scaled(1 / frame.median_luminance)
         for name, kind in missing.items():
             found[name] = measures[kind](frame)
             if results is not None:

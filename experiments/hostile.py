@@ -74,7 +74,7 @@ def own_frame(seed: int) -> Frame:
         albedo=np.ones((*SIZE, 3), np.float32),
         depth=image(seed + 2, *SIZE, 1),
         samples=64,
-        biased={"oidn": np.zeros((*SIZE, 3), np.float32)},
+        estimates={"oidn": np.zeros((*SIZE, 3), np.float32)},
     )
 
 

@@ -44,13 +44,13 @@ def _dual(frame: Frame) -> Image:
     """The dual variant: each half's x with the other half's y."""
     a, b = frame.halves()
     variance = james_stein.smooth_variance(frame.variance)
-    ya, yb = a.biased["oidn"].full, b.biased["oidn"].full
+    ya, yb = a.estimates["oidn"].image, b.estimates["oidn"].image
     return james_stein.combine_dual(a.color, b.color, ya, yb, variance)
 
 
 def images_of(frame: Frame) -> dict[str, Image]:
     """Inputs and combinations by name."""
-    y = frame.biased["oidn"].full
+    y = frame.estimates["oidn"].image
     combined = {
         name: method(frame.color, y, frame.variance)
         for name, method in UNTRAINED.items()
@@ -76,7 +76,7 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
     found = {}
     for path, samples in frames.cases(config.folder, quick=config.quick):
         frame = frames.load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frame.scaled(1 / frame.median_luminance)
         assert frame.reference is not None
         r, noise = frame.reference
         images = images_of(frame)

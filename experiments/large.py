@@ -79,8 +79,8 @@ def enlarged(frame: Frame, size: int) -> Frame:
         the frame, mirrored at its borders; its biased image without halves, so that no
         method makes it anew.
     """
-    y = frame.biased["oidn"]._replace(halves=None)
-    return mirrored(frame._replace(biased={"oidn": y}, reference=None), size)
+    y = frame.estimates["oidn"]._replace(halves=None)
+    return mirrored(frame._replace(estimates={"oidn": y}, reference=None), size)
 
 
 def measure(

@@ -61,7 +61,7 @@ def _errors(images: dict[str, Image], frame: Frame) -> dict[str, float]:
 
 def measure_untrained(frame: Frame) -> dict[str, float]:
     """Inputs, and combinations without a network."""
-    x, y, v = frame.color, frame.biased["oidn"].full, frame.variance
+    x, y, v = frame.color, frame.estimates["oidn"].image, frame.variance
     images = {"path tracing": x, "oidn": y}
     images |= {name: jax.jit(f)(x, y, v) for name, f in UNTRAINED.items()}
     regressed, _ = _james_stein_inputs(frame)

@@ -32,7 +32,7 @@ import numpy as np
 import tyro
 
 from experiments import render, scenes
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 
 PHOTONS = "photons"  # the biased image's name
 ALPHA = 2 / 3
@@ -381,8 +381,8 @@ def assemble(config: Config, moments: dict[str, render.Moments]) -> Frame:
     """
     halves = np.stack([moments[f"photons{k}"].mean[..., :3] for k in range(2)])
     halves = halves.astype(np.float32)
-    image = Biased(halves.mean(axis=0), halves)
-    return render.assemble(config, moments).with_biased(PHOTONS, image)
+    image = Estimate(halves.mean(axis=0), halves)
+    return render.assemble(config, moments).with_estimate(PHOTONS, image)
 
 
 def render_moments(config: Config) -> dict[str, render.Moments]:

@@ -72,12 +72,12 @@ def changed(image: Image, frame: Frame) -> Changed:
     Raises:
         ValueError: if the frame lacks either.
     """
-    if frame.reference is None or "oidn" not in frame.biased:
+    if frame.reference is None or "oidn" not in frame.estimates:
         raise ValueError("a frame has no reference or no biased image 'oidn'")
     r = frame.reference.image
     weight = jnp.square(jnp.mean(r, axis=-1)) + 0.01
     error = lambda i: np.asarray(jnp.mean(jnp.square(i - r), axis=-1) / weight)
-    before = error(frame.biased["oidn"].full)
+    before = error(frame.estimates["oidn"].image)
     change = error(image) - before
     fell, rose = change < 0, change > 0
     return Changed(
@@ -101,7 +101,7 @@ def run(config: Config) -> dict[tuple[str, str], Changed]:
     found = {}
     for path in config.frames:
         frame = exr.read_frame(path)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frame.scaled(1 / frame.median_luminance)
         for name in config.combiners:
             chosen = COMBINERS[name]
             given = [frame, jnp.float32(1)] if chosen.traced else [frame]

@@ -115,7 +115,7 @@ def run(config: Config) -> dict[int, dict[str, tuple[float, float]]]:
     found: dict[int, dict[str, tuple[float, float]]] = {}
     for frame in stages(config):
         assert frame.samples is not None
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frame.scaled(1 / frame.median_luminance)
         samples, images = int(frame.samples), mixed(frame)
         found[samples] = {n: errors(frame, *pair) for n, pair in images.items()}
         row = (f"{n} {a:.5f} ({b:.5f})" for n, (a, b) in found[samples].items())

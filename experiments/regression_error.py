@@ -23,7 +23,7 @@ from experiments import frames
 from jscomb import james_stein
 from jscomb.denoisers import nfor, nonlocal_means
 from jscomb.features import select, stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
 
@@ -55,7 +55,7 @@ worth = jax.jit(james_stein.worth_regressing, static_argnames=("window", "stride
 means = jax.jit(nonlocal_means.denoise)
 
 
-def inputs_of(frame: Frame, base: Biased) -> tuple[Image, ...]:
+def inputs_of(frame: Frame, base: Estimate) -> tuple[Image, ...]:
     """What `cross_regression` takes: both halves' images, and features that tell.
 
     Args:
@@ -76,15 +76,15 @@ def inputs_of(frame: Frame, base: Biased) -> tuple[Image, ...]:
     return (a.color, b.color, *base.halves, *others)
 
 
-def base_of(frame: Frame, name: str) -> Biased:
+def base_of(frame: Frame, name: str) -> Estimate:
     """A biased image of the frame and of its halves, by name."""
     if name != "non-local means":
-        return frame.biased[name]
+        return frame.estimates[name]
     full, *halves = (
         means(part.color, part.color, part.variance)
         for part in (frame, *frame.halves())
     )
-    return Biased(full, jnp.stack(halves))
+    return Estimate(full, jnp.stack(halves))
 
 
 def measure(frame: Frame, name: str, config: Config) -> Row:
@@ -96,7 +96,7 @@ def measure(frame: Frame, name: str, config: Config) -> Row:
     )
     base = base_of(frame, name)
     inputs = inputs_of(frame, base)
-    y = base.full
+    y = base.image
     options = {"window": config.window, "stride": config.stride}
     star = sum(cross(*inputs, **options)) / 2
     noise_of = james_stein.guide_noise(*inputs[2:4], robust=False)
@@ -143,7 +143,7 @@ def measure_nfor(frame: Frame) -> Row:
     """Relative L2 of NFOR."""
     assert frame.reference is not None
     r, noise = frame.reference
-    image = nfor.denoise_frame(frame).full
+    image = nfor.denoise_frame(frame).image
     return {"y": float(rel_l2(image, r, half_difference=noise))}
 
 

@@ -389,7 +389,7 @@ def write(config: Config, frame: Frame) -> Frame:
         the frame that was written.
     """
     if config.denoise and oidn.available():
-        frame = frame.with_biased("oidn", oidn.denoise_frame(frame))
+        frame = frame.with_estimate("oidn", oidn.denoise_frame(frame))
     provenance = {
         "renderer": f"Mitsuba {scenes.mitsuba().__version__}",
         "variant": scenes.mitsuba().variant(),

@@ -71,9 +71,9 @@ def rendering_of(frame: Frame, *, name: str = "oidn") -> Rendering:
     a, b = frame.halves()
     features = stack(frame)
     features = select([features]).of(features)
-    biased = a.biased[name].full, b.biased[name].full
+    biased = a.estimates[name].image, b.estimates[name].image
     images = a.color, b.color, *biased, frame.variance, features
-    return Rendering(*images, frame.exposure)
+    return Rendering(*images, frame.median_luminance)
 
 
 def mirrored(images: Tree, size: int) -> Tree:

@@ -219,7 +219,7 @@ def regressed(frame: Frame, setting: Setting, repeats: int) -> tuple[Image, floa
     Returns:
         y*, and the median seconds of one call.
     """
-    inputs = inputs_of(frame, frame.biased["oidn"])
+    inputs = inputs_of(frame, frame.estimates["oidn"])
     with (
         jax.enable_x64(setting.bits == 64),
         mock.patch.object(regression, "_SIDE", setting.side),
@@ -255,7 +255,7 @@ def run(config: Config) -> tuple[dict[str, float], Results]:
     found: Results = {setting: ([], []) for setting in settings}
     for path, samples in tqdm(cases, unit="frame"):
         frame = frames.load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frame.scaled(1 / frame.median_luminance)
         assert frame.reference is not None
         r, noise = frame.reference
         for setting in settings:

@@ -71,7 +71,7 @@ def cases(size: int, seed: int) -> dict[str, Case]:
     x, v = truth + deviation * noise, jnp.square(deviation)
     plain = Case(x, 1.05 * truth, v, truth)
     at = (slice(None, None, 17), slice(None, None, 13))
-    scaled = lambda s: Case(s * x, s * plain.biased, s * s * v, s * truth)
+    scaled = lambda s: Case(s * x, s * plain.estimates, s * s * v, s * truth)
     one = lambda h, w: Case(*(image[:h, :w] for image in plain))
     burnt = plain._replace(unbiased=x.at[at].set(1e6), variance=v.at[at].set(1e12))
     return {

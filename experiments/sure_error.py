@@ -68,7 +68,7 @@ class Config:
 def oidn_of(frame: Frame) -> Callable[[Image], Image]:
     """Open Image Denoise with the frame's features and exposure."""
     return lambda x: oidn.denoise(
-        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.exposure
+        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.median_luminance
     )
 
 
@@ -207,7 +207,7 @@ def run(config: Config) -> dict:
     if config.quick:
         path, samples = frames.cases(config.folder, quick=True)[0]
     frame = frames.load(path, samples)  # before the long part, in case it is missing
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.scaled(1 / frame.median_luminance)
     found = frames.measured(
         config.folder, {"": measure}, results=config.results, quick=config.quick
     )

@@ -123,7 +123,7 @@ def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
         inputs.append(
             {name: np.stack([v[name] for v in variants]) for name in variants[0]}
         )
-        references.append(np.asarray(frame.reference.image / frame.exposure))
+        references.append(np.asarray(frame.reference.image / frame.median_luminance))
     arrays = {name: np.stack([i[name] for i in inputs]) for name in inputs[0]}
     return training.Examples(
         {name: jnp.asarray(a, jnp.float32) for name, a in arrays.items()},

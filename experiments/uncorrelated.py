@@ -114,14 +114,14 @@ def measure(
     windows: tuple[int, ...],
 ) -> dict:
     """Errors of all methods, and every gamma."""
-    scale = 1 / independent.exposure
+    scale = 1 / independent.median_luminance
     every, z_frame = (f.scaled(scale) for f in (independent, correlated))
     r, noise = (i * scale for i in reference)
     y_frame = first_half(every)
     y, z, n = y_frame.buffers.color, z_frame.buffers.color, y_frame.samples / 4
     images = {
         "path tracing": every.color,
-        "oidn": every.biased["oidn"].full,
+        "oidn": every.estimates["oidn"].image,
         "common numbers": z_frame.color,
         "both": (y_frame.color + z_frame.color) / 2,
         "uniform": uncorrelated.combine_uniform(y, z),

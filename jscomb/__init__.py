@@ -4,11 +4,10 @@ Each paper is one module of pure functions, and each has the verb `combine`::
 
     from jscomb import exr, james_stein
     frame = exr.read_frame("frame.exr")
-    denoised = frame.biased["oidn"].full
+    denoised = frame.estimates["oidn"].image
     image = james_stein.combine(frame.color, denoised, frame.variance)
 """
 
-from jscomb import choice as choice
 from jscomb import denoisers as denoisers
 from jscomb import double_shrinkage as double_shrinkage
 from jscomb import ensemble as ensemble
@@ -21,6 +20,5 @@ from jscomb import metrics as metrics
 from jscomb import numerics as numerics
 from jscomb import progressive as progressive
 from jscomb import uncorrelated as uncorrelated
-from jscomb.choice import choose as choose
 
 __version__ = "0.1.0"

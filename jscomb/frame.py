@@ -1,28 +1,37 @@
-"""What a renderer hands over: one frame with its buffers, halves and statistics.
+"""A rendered frame with its buffers and halves, and the images estimated from it.
 
 A `Frame` stores each quantity once, as K independent sub-buffers on the first axis
 (disjoint samples, equally many), and derives the rest: the full image is their mean,
 the half buffers are the means of the first and the last K/2. Halves are frames
 themselves, so with K = 4 a combiner of halves can be judged by halves again. K = 1 is a
-frame too; what needs halves then says so.
+frame too; what needs halves raises an error there.
 
-Everything is an array, so a frame is a pytree: it jits, vmaps and differentiates. Where
-it came from is not part of it; `exr.read_provenance` tells.
+An `Estimate` is an image of a frame and the same image made from each half alone.
+Whoever makes an image of a frame makes an `Estimate`: denoisers, combiners, networks,
+files. So a combiner's result goes wherever a denoiser's goes, and every estimate is
+judged the same way: by the half that it was not made from. `with_halves` makes one.
 
-Units: colour, biased images and reference are linear scene-referred radiance; variance
-is of the mean, squared radiance; albedo, visibility in [0, 1]; normals of unit length
-or 0; depth a distance, 0 where there is nothing.
+All are pytrees of arrays: they jit, vmap and differentiate. Where a frame came from is
+not part of it; `exr.read_provenance` returns that.
+
+Units: colour, estimates and reference are linear scene-referred radiance; variance is
+of the mean, squared radiance; albedo and visibility are in [0, 1]; normals have unit
+length or are 0; depth is a distance, 0 where there is nothing. A frame is *normalised*
+when its radiance was divided by its median luminance (`Frame.normalised`). Networks and
+regressions have absolute constants, so their functions of frames need that; the front
+door `jscomb.combine` normalises once, and scales the result back once.
 """
 
-from collections.abc import Mapping
-from typing import NamedTuple
+import importlib.util
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jscomb.numerics.exposure import exposure
 from jscomb.numerics.guards import finite
+from jscomb.numerics.luminance import median_luminance
 from jscomb.typing import Image, Mask, Scalar, Variance
 
 CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
@@ -33,7 +42,7 @@ class Buffers(NamedTuple):
 
     Attributes:
         color: radiance of each sub-buffer, [K,H,W,C].
-        variance: of the mean of that sub-buffer, [K,H,W,C]; None if not known.
+        variance: of the mean of that sub-buffer, [K,H,W,C]; None if unknown.
         albedo: [K,H,W,3]; this and the other features may be None, or have one
             sub-buffer that all share.
         normal: [K,H,W,3].
@@ -49,16 +58,26 @@ class Buffers(NamedTuple):
     visibility: Float[Array, "_ h w 1"] | None = None
 
 
-class Biased(NamedTuple):
-    """A biased image of a frame: denoised, photon mapped, ...
+class Estimate(NamedTuple):
+    """An image of a frame: denoised, photon mapped, combined, ...
 
     Attributes:
-        full: made from the full frame, radiance, [H,W,C].
-        halves: made from each half alone, [2,H,W,C]; None if there are none.
+        image: made from the full frame, radiance, [H,W,C].
+        halves: made from each half alone, [2,H,W,C]; None if they cannot be made.
     """
 
-    full: Image
+    image: Image
     halves: Float[Array, "2 h w c"] | None = None
+
+    def half(self, number: int) -> "Estimate":
+        """Return the estimate of half 0 or 1, without halves of its own."""
+        if self.halves is None:
+            raise ValueError("this estimate has no halves")
+        return Estimate(self.halves[number])
+
+    def scaled(self, factor: Scalar | float) -> "Estimate":
+        """Return the estimate with its radiance multiplied by a positive factor."""
+        return jax.tree.map(lambda image: image * factor, self)
 
 
 class Reference(NamedTuple):
@@ -67,7 +86,7 @@ class Reference(NamedTuple):
     Attributes:
         image: mean of its two halves, radiance, [H,W,C].
         half_difference: half a minus half b, to correct errors for the reference's
-            own noise, [H,W,C]; None if not known.
+            own noise, [H,W,C]; None if unknown.
     """
 
     image: Image
@@ -79,15 +98,18 @@ class Frame(NamedTuple):
 
     Attributes:
         buffers: the stored sub-buffers.
-        samples: samples a pixel of the full frame; None if not known.
-        biased: biased images by name; not to be changed, see `with_biased`.
+        samples: samples a pixel of the full frame; None if unknown.
+        estimates: estimates by name; not to be changed, see `with_estimate`.
         reference: None if there is none.
+        unit: the radiance that a normalised frame was divided by; None for a frame in
+            its renderer's units.
     """
 
     buffers: Buffers
     samples: Scalar | None
-    biased: dict[str, Biased]
+    estimates: dict[str, Estimate]
     reference: Reference | None
+    unit: Scalar | None = None
 
     @property
     def sub_buffers(self) -> int:
@@ -139,11 +161,12 @@ class Frame(NamedTuple):
         return _mean(self.buffers.visibility)
 
     def halves(self) -> tuple["Frame", "Frame"]:
-        """The two half frames, of disjoint samples; independent of each other.
+        """Return the two half frames, of disjoint samples, independent of each other.
 
         Returns:
-            frames of K/2 sub-buffers each, with the biased images made from that half
-            (those without halves are left out), without reference.
+            frames of K/2 sub-buffers each, with the estimates made from that half
+            (those without halves are excluded), without reference; normalised by the
+            full frame's unit if that is normalised.
 
         Raises:
             ValueError: if the frame has no sub-buffers.
@@ -158,18 +181,19 @@ class Frame(NamedTuple):
             return Frame(
                 jax.tree.map(lambda buffer: _half(buffer, number), self.buffers),
                 samples=None if self.samples is None else self.samples / 2,
-                biased={
-                    name: Biased(image.halves[number])
-                    for name, image in self.biased.items()
-                    if image.halves is not None
+                estimates={
+                    name: estimate.half(number)
+                    for name, estimate in self.estimates.items()
+                    if estimate.halves is not None
                 },
                 reference=None,
+                unit=self.unit,
             )
 
         return half(0), half(1)
 
     def merged(self, sub_buffers: int) -> "Frame":
-        """The same frame with fewer sub-buffers, neighbours averaged.
+        """Return the same frame with fewer sub-buffers, neighbours averaged.
 
         Args:
             sub_buffers: how many to keep, 1 or even; divides the present number.
@@ -198,45 +222,68 @@ class Frame(NamedTuple):
 
     @property
     def valid(self) -> Mask:
-        """Pixels that are finite in every buffer and biased image, [H,W,1]."""
+        """Pixels that are finite in every buffer and estimate, [H,W,1]."""
         stored = [b for b in self.buffers if b is not None]
-        stored += [h for i in self.biased.values() for h in i if h is not None]
+        stored += jax.tree.leaves(self.estimates)
         images = [i for b in stored for i in (b if b.ndim == 4 else b[None])]
         return finite(*images)
 
     @property
-    def exposure(self) -> Scalar:
-        """A radiance typical of the frame: the median of its positive luminances.
+    def median_luminance(self) -> Scalar:
+        """The median of the colour's positive luminances, linear radiance.
 
         Robust against fireflies and black backgrounds; 1 for a frame that is all
-        black. Divide by it (`scaled`) before a method with absolute constants.
+        black.
         """
-        return exposure(self.color)
+        return median_luminance(self.color)
 
-    def scaled(self, factor: Scalar | float) -> "Frame":
-        """The frame with all radiance multiplied by `factor`, variances by its square.
+    def normalised(self, unit: Scalar | float | None = None) -> "Frame":
+        """Return the frame with radiance divided by its median luminance.
 
         Args:
-            factor: positive, for example 1 / `exposure`.
+            unit: linear radiance, positive, to divide by instead: frames that are to be
+                compared share one.
 
         Returns:
-            the frame; features are unchanged.
+            the frame, with `unit` set; itself if it is normalised already. Multiply
+            what is made of it by `unit` (`Estimate.scaled`).
+
+        Raises:
+            ValueError: if a unit is given for a frame that is normalised already.
+        """
+        if self.unit is not None:
+            if unit is not None:
+                raise ValueError("this frame is normalised already")
+            return self
+        divisor = self.median_luminance if unit is None else jnp.asarray(unit)
+        divisor = divisor.astype(self.buffers.color.dtype)
+        return self.scaled(1 / divisor)._replace(unit=divisor)
+
+    def scaled(self, factor: Scalar | float) -> "Frame":
+        """Return the frame with radiance multiplied by a factor.
+
+        Args:
+            factor: positive.
+
+        Returns:
+            the frame, variances multiplied by the factor's square, features unchanged;
+            no longer normalised.
         """
         color, variance, *features = self.buffers
         if variance is not None:
-            variance = variance * jnp.square(factor)
-        scale = lambda image: image * factor
-        biased = jax.tree.map(scale, self.biased)
-        reference = jax.tree.map(scale, self.reference)
+            # Twice: the square may leave the range of float32.
+            variance = variance * factor * factor
+        images = self.estimates, self.reference
+        estimates, reference = jax.tree.map(lambda image: image * factor, images)
         buffers = Buffers(color * factor, variance, *features)
-        return self._replace(buffers=buffers, biased=biased, reference=reference)
+        return Frame(buffers, self.samples, estimates, reference)
 
-    def with_biased(self, name: str, image: Biased | ArrayLike) -> "Frame":
-        """The frame with one more biased image.
+    def with_estimate(self, name: str, estimate: Estimate | ArrayLike) -> "Frame":
+        """Return the frame with one more estimate.
 
         Args:
-            name: to call it by.
-            image: the image of the full frame [H,W,C], or with that of the halves.
+            name: of the estimate; replaces one of the same name.
+            estimate: the image of the full frame [H,W,C], or with that of the halves.
 
         Returns:
             a new frame; this one is unchanged.
@@ -244,9 +291,192 @@ class Frame(NamedTuple):
         Raises:
             ValueError: if the shape is not the colour's.
         """
-        return self._replace(
-            biased=self.biased | {name: _checked_biased(name, image, self.color.shape)}
-        )
+        checked = _checked_estimate(name, estimate, self.color.shape)
+        return self._replace(estimates=self.estimates | {name: checked})
+
+    def require(self, who: str, needs: "Needs") -> None:
+        """Raise unless the frame has what a method needs.
+
+        Args:
+            who: the method's name.
+            needs: what it needs.
+
+        Raises:
+            ValueError: names the method, what is missing and how to get it.
+            ImportError: likewise, if a package is missing.
+        """
+        if missing := needs.missing(self):
+            kind = ImportError if needs.missing_package() else ValueError
+            raise kind(f"{who} needs {missing}")
+
+
+class Needs(NamedTuple):
+    """What a denoiser or combiner needs of a frame.
+
+    Attributes:
+        variance: variances, or sub-buffers to estimate them from.
+        halves: half buffers, and the variances of each if it needs variances.
+        channels: of the colour; None for any number.
+        features: names of features, such as albedo.
+        normalised: radiance divided by the median luminance.
+        extra: the extra of jscomb that installs a package it needs; None for none.
+        package: that package's module.
+    """
+
+    variance: bool = False
+    halves: bool = False
+    channels: int | None = None
+    features: tuple[str, ...] = ()
+    normalised: bool = False
+    extra: str | None = None
+    package: str | None = None
+
+    @property
+    def sub_buffers(self) -> int:
+        """Independent sub-buffers that it needs at least."""
+        return 2 if self.halves else 1
+
+    def missing_package(self) -> str:
+        """Return which package is missing and how to install it; empty if none."""
+        if self.package is None or importlib.util.find_spec(self.package):
+            return ""
+        return f'the package {self.package}: pip install "jscomb[{self.extra}]"'
+
+    def missing(self, frame: Frame) -> str:
+        """Return what a frame lacks and how to get it, in one line; empty if nothing.
+
+        Args:
+            frame: the frame.
+
+        Returns:
+            the line, to follow "needs".
+        """
+        return self._missing(frame, frame.sub_buffers)
+
+    def missing_for_halves(self, frame: Frame) -> str:
+        """Return what the halves of a frame lack; empty if each half has enough.
+
+        Args:
+            frame: the full frame.
+
+        Returns:
+            the line, to follow "needs".
+        """
+        if frame.sub_buffers < 2:
+            return "half buffers: render at least 2 sub-buffers (this frame has 1)"
+        return self._missing(frame, frame.sub_buffers // 2)
+
+    def _missing(self, frame: Frame, k: int) -> str:
+        """What a frame, or a half of it, with `k` sub-buffers lacks."""
+        total = frame.sub_buffers
+        unknown = self.variance and frame.buffers.variance is None
+        wanted = self.sub_buffers * (2 if unknown else 1)
+        channels = frame.buffers.color.shape[-1]
+        lacking = [f for f in self.features if getattr(frame.buffers, f) is None]
+        if self.normalised and frame.unit is None:
+            return "a normalised frame: call frame.normalised(), or use jscomb.combine"
+        if k < wanted and not self.halves:
+            return (
+                f"the variance, given or estimated from sub-buffers: render with "
+                f"variances, or at least {wanted * total // k} sub-buffers (this frame "
+                f"has {total})"
+            )
+        if k < wanted:
+            return (
+                f"half buffers: render at least {wanted * total // k} sub-buffers (this "
+                f"frame has {total})"
+            )
+        if self.channels not in (None, channels):
+            return f"{self.channels} channels of colour, not {channels}"
+        if lacking:
+            return f"{', '.join(lacking)}: render with these features"
+        return self.missing_package()
+
+
+Maker = Callable[[Frame], Estimate]
+"""A denoiser, or a combiner with its other arguments bound."""
+
+
+def with_halves(
+    frame: Frame,
+    make: Callable[..., Image],
+    *given: Any,
+    needs: Needs = Needs(),  # noqa: B008 (immutable)
+) -> Estimate:
+    """Make an image of a frame, and the same image of each half alone.
+
+    Args:
+        frame: the frame.
+        make: from a frame, or a half as a frame, and its estimates to an image [H,W,C].
+        given: what `make` takes beside the frame: estimates, makers of them, or trees
+            of both. For a half, an estimate stands for its half, which has no halves
+            of its own; a maker is called with the half.
+        needs: what `make` needs of a frame; with `needs.halves` estimates must have
+            halves.
+
+    Returns:
+        the estimate; its halves are None where a half lacks what is needed
+        (`needs.missing_for_halves`), or an estimate has no halves to pass on.
+
+    Example:
+        >>> frame = make_frame(jnp.stack([jnp.zeros((2, 2, 1)), jnp.ones((2, 2, 1))]))
+        >>> double = lambda part: 2 * part.color
+        >>> made = with_halves(frame, double)
+        >>> print(made.image[0, 0], made.halves[:, 0, 0, 0])
+        [1.] [0. 2.]
+        >>> add = lambda part, estimate: part.color + estimate.image
+        >>> print(with_halves(frame, add, made).halves[:, 0, 0, 0])
+        [0. 3.]
+    """
+    image = make(frame, *estimates_of(frame, given))
+    fixed = [e for e in _leaves(given) if isinstance(e, Estimate)]
+    if (
+        needs.missing_for_halves(frame)
+        or any(e.halves is None for e in fixed)
+        or (needs.halves and fixed)
+    ):
+        return Estimate(image)
+    halves = [
+        make(half, *estimates_of(half, given, number))
+        for number, half in enumerate(frame.halves())
+    ]
+    return Estimate(image, jnp.stack(halves))
+
+
+def estimates_of(part: Frame, given: Any, number: int | None = None) -> Any:
+    """Return the estimates of a frame, or of one of its halves.
+
+    Args:
+        part: the frame or the half.
+        given: estimates of the frame, makers, or a tree of both.
+        number: of the half, 0 or 1; None for the frame.
+
+    Returns:
+        the tree with an estimate in place of each maker.
+
+    Example:
+        >>> frame = make_frame(jnp.ones((2, 2, 2, 1)))
+        >>> maker = lambda part: Estimate(3 * part.color)
+        >>> print(estimates_of(frame, {"three": maker})["three"].image[0, 0])
+        [3.]
+    """
+
+    def one(each: Estimate | Maker) -> Estimate:
+        if not isinstance(each, Estimate):
+            return each(part)
+        return each if number is None else each.half(number)
+
+    return jax.tree.map(one, given, is_leaf=_is_leaf)
+
+
+def _leaves(given: Any) -> list[Any]:
+    """The estimates and makers of a tree."""
+    return jax.tree.leaves(given, is_leaf=_is_leaf)
+
+
+def _is_leaf(tree: Any) -> bool:
+    """Whether a part of a tree is one estimate."""
+    return isinstance(tree, Estimate)
 
 
 def make_frame(
@@ -258,7 +488,7 @@ def make_frame(
     depth: ArrayLike | None = None,
     visibility: ArrayLike | None = None,
     samples: float | int | None = None,
-    biased: Mapping[str, Biased | ArrayLike] | None = None,
+    estimates: Mapping[str, Estimate | ArrayLike] | None = None,
     reference: Reference | ArrayLike | None = None,
 ) -> Frame:
     """Build a frame and check every shape, once.
@@ -273,7 +503,7 @@ def make_frame(
         depth: [K,H,W,1] or [H,W,1].
         visibility: [K,H,W,1] or [H,W,1].
         samples: samples a pixel of the full frame, positive.
-        biased: biased images by name, [H,W,C] each or `Biased`.
+        estimates: estimates by name, [H,W,C] each or `Estimate`.
         reference: [H,W,C] or `Reference`.
 
     Returns:
@@ -315,7 +545,9 @@ def make_frame(
     return Frame(
         Buffers(color, variance, **features),
         samples=None if samples is None else jnp.asarray(samples, color.dtype),
-        biased={n: _checked_biased(n, i, full) for n, i in (biased or {}).items()},
+        estimates={
+            n: _checked_estimate(n, e, full) for n, e in (estimates or {}).items()
+        },
         reference=reference,
     )
 
@@ -374,14 +606,15 @@ def _checked_feature(name: str, feature: ArrayLike, color: tuple[int, ...]) -> A
     return stacked
 
 
-def _checked_biased(
-    name: str, image: Biased | ArrayLike, shape: tuple[int, ...]
-) -> Biased:
-    """A biased image of the colour's shape."""
-    given = image if isinstance(image, Biased) else Biased(jnp.asarray(image))
-    full, halves = (None if i is None else jnp.asarray(i) for i in given)
-    assert full is not None
-    _expect(f"biased image {name!r}", full, [shape])
+def _checked_estimate(
+    name: str, estimate: Estimate | ArrayLike, shape: tuple[int, ...]
+) -> Estimate:
+    """An estimate of the colour's shape."""
+    if not isinstance(estimate, Estimate):
+        estimate = Estimate(jnp.asarray(estimate))
+    image, halves = (None if i is None else jnp.asarray(i) for i in estimate)
+    assert image is not None
+    _expect(f"estimate {name!r}", image, [shape])
     if halves is not None:
-        _expect(f"biased image {name!r} of halves", halves, [(2, *shape)])
-    return Biased(full, halves)
+        _expect(f"the halves of estimate {name!r}", halves, [(2, *shape)])
+    return Estimate(image, halves)

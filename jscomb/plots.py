@@ -37,7 +37,7 @@ def comparison(
         >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> grey = jnp.full((4, 4, 3), 0.2)
-        >>> frame = make_frame(grey, biased={"denoised": grey}, reference=grey)
+        >>> frame = make_frame(grey, estimates={"denoised": grey}, reference=grey)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     comparison(f"{folder}/errors.png", [(frame, {"combined": grey})])
         ...     print(os.listdir(folder))
@@ -49,7 +49,7 @@ def comparison(
             raise ValueError("a comparison needs a frame with a reference")
         spp = "" if frame.samples is None else f", {float(frame.samples):.0f} spp"
         inputs = {f"path tracing{spp}": frame.color}
-        inputs |= {name: image.full for name, image in frame.biased.items()}
+        inputs |= {name: image.image for name, image in frame.estimates.items()}
         rows.append((frame.reference, inputs | combined))
     columns = 1 + max(len(images) for _, images in rows)
     figure, axes = plt.subplots(

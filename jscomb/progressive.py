@@ -34,15 +34,21 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from jscomb.numerics.exposure import in_units
-from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.numerics.guards import (
+    check_same_shape,
+    divide,
+    finite,
+    first_finite,
+    zero_invalid,
+)
+from jscomb.numerics.luminance import at_unit_luminance
 from jscomb.numerics.windows import (
     at_window_max,
     check_window,
     separable_sum,
     window_sum,
 )
-from jscomb.typing import Image, Scalar, Variance
+from jscomb.typing import Image, Variance
 
 Mixing = Callable[[Image, Image, Variance, Image], Image]
 
@@ -109,7 +115,6 @@ def neural_combine(
     *,
     activate: Callable[[Float[Array, "h w 3 c"]], Image] | None = None,
     bound: bool = True,
-    exposure: Scalar | None = None,
 ) -> Image:
     """Mix a rendering and its denoised image as a network says.
 
@@ -117,7 +122,7 @@ def neural_combine(
     parameters.
 
     Args:
-        network: of x, y, v and s, finite and at an exposure of one, to what `activate`
+        network: of x, y, v and s, finite and normalised, to what `activate`
             takes, such as `learning.networks.MixingNetwork`.
         unbiased: x, linear radiance, shape [H,W,C].
         biased: y, likewise.
@@ -126,7 +131,6 @@ def neural_combine(
         activate: alpha from the outputs: `activation`, which is taken for None, or
             `direct_activation`.
         bound: take alpha back where it is not consistent with the noise.
-        exposure: what to divide radiance by; None for `numerics.exposure` of x.
 
     Returns:
         z, linear radiance, shape [H,W,C]; at an invalid pixel the first finite of
@@ -145,10 +149,56 @@ def neural_combine(
     Source: PD eq. 11, 18, 19.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
-    valid = finite(unbiased, biased, variance, sure)
+    combine_normalised = lambda *images: neural_combine_normalised(
+        network, *images, activate=activate, bound=bound
+    )
+    squares = variance, sure
+    return at_unit_luminance(combine_normalised, unbiased, biased, squares=squares)
 
-    def mix(x: Image, y: Image, v: Variance, s: Image) -> Image:
-        _, x, y, v, s = in_units(exposure, valid, x, y, variance=v, sure=s)
+
+def neural_combine_normalised(
+    network: Callable[[Image, Image, Variance, Image], Float[Array, "h w 3 c"]],
+    unbiased: Image,
+    biased: Image,
+    variance: Variance,
+    sure: Image,
+    *,
+    activate: Callable[[Float[Array, "h w 3 c"]], Image] | None = None,
+    bound: bool = True,
+) -> Image:
+    """Mix normalised images; for crops of a normalised frame, and for training.
+
+    Not scale-equivariant, and local without the bound: `neural_combine` without its
+    normalisation.
+
+    Args:
+        network: as for `neural_combine`.
+        unbiased: x, normalised radiance, shape [H,W,C].
+        biased: y, likewise.
+        variance: v of the mean x, at least zero, likewise.
+        sure: s, likewise.
+        activate: as for `neural_combine`.
+        bound: lower alpha where the mix is not consistent with the noise.
+
+    Returns:
+        z, normalised radiance, shape [H,W,C]; at an invalid pixel the first finite of
+        (y, x), else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> at = lambda value: jnp.full((3, 3, 1), value)
+        >>> network = lambda *_: jnp.stack([at(0.5), at(0.25), at(1.0)], axis=2)
+        >>> images = at(3.0), at(1.0), at(1.0), at(2.0)
+        >>> print(neural_combine_normalised(network, *images, bound=False)[0, 0])
+        [2.5]
+
+    Source: PD eq. 11, 18, 19.
+    """
+
+    def mix(*images: Image) -> Image:
+        _, x, y, v, s = zero_invalid(*images)
         return (activate or activation)(network(x, y, v, s))
 
     return combine(unbiased, biased, variance, sure, mix=mix, bound=bound)

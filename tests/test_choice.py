@@ -7,7 +7,7 @@ import pytest
 
 from jscomb import choice, choose, metrics
 from jscomb.denoisers import oidn
-from jscomb.frame import Biased, make_frame
+from jscomb.frame import Estimate, make_frame
 
 CHEAP = [choice.KEEP, "whitened"]
 key = lambda: jax.random.key(0)
@@ -42,7 +42,7 @@ def test_a_perfect_image_is_kept_and_a_wrong_one_is_not(truth_is):
     frame = make_frame(
         1 + 0.1 * noise,
         variance=one * 0.01 / 2,
-        biased={"y": Biased(y, jnp.stack([y, y]))},
+        estimates={"y": Estimate(y, jnp.stack([y, y]))},
     )
     found = choose(frame, methods=CHEAP)
     assert found.method == (choice.KEEP if truth_is == "biased" else "whitened")
@@ -75,8 +75,8 @@ def test_what_needs_halves_is_judged_by_quarters(glass_frame):
 
 def test_without_halves_nothing_is_known(glass_frame):
     assert choose(glass_frame.merged(1)) == choice.Choice("whitened", ())
-    y = glass_frame.biased["oidn"].full
-    alone = glass_frame._replace(biased={}).with_biased("y", y)
+    y = glass_frame.estimates["oidn"].image
+    alone = glass_frame._replace(estimates={}).with_estimate("y", y)
     assert choose(alone) == choice.Choice("whitened", ())
 
 
@@ -91,7 +91,7 @@ def test_invalid_pixels_do_not_decide(glass_frame):
 def test_bad_input(glass_frame):
     with pytest.raises(ValueError, match=r"no biased image 'x'; there are \['oidn'\]"):
         choose(glass_frame, name="x")
-    two = glass_frame.with_biased("other", glass_frame.biased["oidn"])
+    two = glass_frame.with_estimate("other", glass_frame.estimates["oidn"])
     with pytest.raises(ValueError, match="of which biased image"):
         choose(two)
     for methods in ([], ["kept", "x"]):

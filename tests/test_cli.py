@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jscomb import choice, exr, metrics
-from jscomb.frame import Biased
+from jscomb.frame import Estimate
 from jscomb.numerics.guards import finite
 from tests.conftest import DATA
 from tests.test_exr import layer, noise, write
@@ -65,8 +65,8 @@ def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
 def test_combine_keeps_what_it_cannot_better(jscomb, tmp_path, glass_frame):
     """A biased image that is the truth can only be harmed, and the halves tell."""
     truth = glass_frame.reference.image
-    frame = glass_frame._replace(biased={})
-    perfect = frame.with_biased("perfect", Biased(truth, np.stack([truth, truth])))
+    frame = glass_frame._replace(estimates={})
+    perfect = frame.with_estimate("perfect", Estimate(truth, np.stack([truth, truth])))
     exr.write_frame(tmp_path / "f.exr", perfect)
     status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
     assert status == 0
@@ -167,7 +167,7 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
     assert "25 of 4096 pixels are not finite and were left out" in out
     r, noise = glass_frame.reference
     mask = finite(color[0])
-    y = glass_frame.biased["oidn"].full
+    y = glass_frame.estimates["oidn"].image
     error = metrics.rel_l2(y, r, half_difference=noise, mask=mask)
     np.testing.assert_allclose(errors_in(out)["oidn"], float(error), atol=6e-6)
 
@@ -218,7 +218,7 @@ def moments(folder):
 
 def several(folder):
     frame = exr.read_frame(GLASS)
-    exr.write_frame(folder / "two.exr", frame.with_biased("other", frame.color))
+    exr.write_frame(folder / "two.exr", frame.with_estimate("other", frame.color))
     return folder / "two.exr"
 
 

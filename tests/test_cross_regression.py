@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import features, james_stein
-from jscomb.frame import Biased, make_frame
+from jscomb.frame import Estimate, make_frame
 from tests.statistics import assert_mean
 from tests.test_regression import gaussian, oracle
 
@@ -181,7 +181,7 @@ def textured(noise):
         albedo=albedo,
         reference=albedo,
     )
-    return frame.with_biased("blurred", Biased(blurred.mean(0), jnp.asarray(blurred)))
+    return frame.with_estimate("blurred", Estimate(blurred.mean(0), jnp.asarray(blurred)))
 
 
 def test_regresses_where_features_explain_the_radiance():
@@ -189,18 +189,18 @@ def test_regresses_where_features_explain_the_radiance():
     done = james_stein.regress(jax.random.key(0), frame, "blurred", window=9)
     assert done.ran
     error = lambda image: float(jnp.mean((image - frame.reference.image) ** 2))
-    old, new = error(frame.biased["blurred"].full), error(done.biased.full)
+    old, new = error(frame.estimates["blurred"].image), error(done.estimate.image)
     assert new < 0.2 * old
-    assert done.biased.halves.shape == (2, 40, 40, 3)
+    assert done.estimate.halves.shape == (2, 40, 40, 3)
 
 
 def test_leaves_a_perfect_image_alone():
     frame = textured(0.3)
     truth = frame.reference.image
-    frame = frame.with_biased("truth", Biased(truth, jnp.stack([truth, truth])))
+    frame = frame.with_estimate("truth", Estimate(truth, jnp.stack([truth, truth])))
     done = james_stein.regress(jax.random.key(0), frame, "truth", window=9)
     assert not done.ran
-    assert done.biased is frame.biased["truth"]
+    assert done.estimate is frame.estimates["truth"]
     assert done.change.mean > 0
 
 
@@ -211,7 +211,7 @@ def test_regress_is_scale_equivariant():
     for scale in (1e-4, 1e5):
         other = regress(frame.scaled(scale))
         np.testing.assert_allclose(
-            other.biased.full, scale * one.biased.full, rtol=1e-8
+            other.estimates.image, scale * one.biased.image, rtol=1e-8
         )
         np.testing.assert_allclose(other.change.mean, one.change.mean, rtol=1e-6)
 

@@ -368,18 +368,18 @@ def test_a_frame_is_made_of_the_parts(glass_frame):
     """At an exposure of one, features without those that tell nothing."""
     frame = glass_frame._replace(reference=None)
     found = double_shrinkage.combine_frame(frame, "oidn", window=9, stride=1)
-    e = frame.exposure
+    e = frame.median_luminance
     a, b = frame.halves()
-    u, y = frame.color / e, frame.biased["oidn"]
-    v = double_shrinkage.unbiased_error(u, y.full / e, frame.variance / e**2)
+    u, y = frame.color / e, frame.estimates["oidn"]
+    v = double_shrinkage.unbiased_error(u, y.image / e, frame.variance / e**2)
     m = double_shrinkage.biased_error(*(i / e for i in (a.color, b.color, *y.halves)))
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
     features = stack(frame)
     first = double_shrinkage.factors(v, m, 0 * v)
-    x1, s = first.blend(u, y.full / e), one(first.error)
+    x1, s = first.blend(u, y.image / e), one(first.error)
     p = prior(x1, x1, s, s, features, window=9)
-    eta = double_shrinkage.confidence(p, u, y.full / e, v, m)
-    expected = e * combine(p, u, y.full / e, v, m, eta)
+    eta = double_shrinkage.confidence(p, u, y.image / e, v, m)
+    expected = e * combine(p, u, y.image / e, v, m, eta)
     np.testing.assert_allclose(found.image, expected, rtol=2e-3, atol=1e-3 * e)
     np.testing.assert_allclose(found.mse, e**2 * m, rtol=1e-4)
     assert np.all((found.prior_share >= 0) & (found.prior_share <= 1))
@@ -390,7 +390,7 @@ def test_a_frame_is_made_of_the_parts(glass_frame):
 
 
 def test_frames_without_what_it_takes(glass_frame):
-    alone = glass_frame.with_biased("photons", glass_frame.color)
+    alone = glass_frame.with_estimate("photons", glass_frame.color)
     for name in ("photons", "caustics"):
         with pytest.raises(
             ValueError, match=rf"no biased image '{name}' with halves; "
@@ -401,16 +401,16 @@ def test_frames_without_what_it_takes(glass_frame):
 def test_ugly_frames(glass_frame):
     """A bad pixel in either image keeps to itself; features are optional."""
     color = glass_frame.buffers.color.at[0, 20, 30].set(jnp.nan)
-    photons = glass_frame.biased["oidn"]
-    photons = photons._replace(full=photons.full.at[40, 9].set(jnp.inf))
+    photons = glass_frame.estimates["oidn"]
+    photons = photons._replace(image=photons.image.at[40, 9].set(jnp.inf))
     frame = make_frame(
         color,
         variance=glass_frame.buffers.variance,
         samples=64,
-        biased={"photons": photons},
+        estimates={"photons": photons},
     )
     found = double_shrinkage.combine_frame(frame, "photons", window=9, stride=1)
     assert all(np.isfinite(part).all() for part in found if part is not found.prior)
     assert np.isfinite(np.delete(found.prior.reshape(-1, 3), (1310, 2569), 0)).all()
-    np.testing.assert_allclose(found.image[20, 30], photons.full[20, 30], rtol=1e-6)
+    np.testing.assert_allclose(found.image[20, 30], photons.image[20, 30], rtol=1e-6)
     np.testing.assert_allclose(found.image[40, 9], frame.color[40, 9], rtol=1e-6)

@@ -59,9 +59,9 @@ def test_errors_are_those_of_the_metrics(folder, glass_frame):
     ).items()
     assert key == ("glass", 64)
     assert errors.keys() == {"path tracing", "oidn", *UNTRAINED, "auto", "dual"}
-    frame = glass_frame.scaled(1 / glass_frame.exposure)
+    frame = glass_frame.scaled(1 / glass_frame.median_luminance)
     r, noise = frame.reference
-    expected = metrics.rel_l2(frame.biased["oidn"].full, r, half_difference=noise)
+    expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
     np.testing.assert_allclose(errors["oidn"], expected, rtol=1e-5)
     assert errors["auto"] in (errors["oidn"], errors["whitened"])
     with pytest.raises(ValueError, match=r"no \.npz archive"):
@@ -83,9 +83,9 @@ def test_regression_is_measured(folder, tmp_path):
     assert regression_error.run(config) == found  # kept, and not measured again
     row = found["glass 64 oidn"]
     frame = frames.load(folder / "glass.npz", 64)
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.scaled(1 / frame.median_luminance)
     r, noise = frame.reference
-    expected = metrics.rel_l2(frame.biased["oidn"].full, r, half_difference=noise)
+    expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
     np.testing.assert_allclose(row["y"], expected, rtol=1e-6)
     assert row["features"] == 8
     image, seconds = speed_error.regressed(frame, speed_error.Setting(4, 11), 1)
@@ -158,8 +158,8 @@ def test_double_shrinkage_is_measured(tmp_path, vectorised):
     whole = exr.read_frame(tmp_path / "cornell-caustic-whole.exr")
     r, noise = whole.reference
     expected = metrics.rel_l2(
-        *(i / whole.exposure for i in (whole.color, r)),
-        half_difference=noise / whole.exposure,
+        *(i / whole.median_luminance for i in (whole.color, r)),
+        half_difference=noise / whole.median_luminance,
     )
     alone = row["error"]["path tracing alone"]
     np.testing.assert_allclose(alone, expected, rtol=1e-4)
@@ -217,8 +217,8 @@ def test_networks_are_measured_beside_the_rest(folder, glass_frame):
     errors = rows["glass", 64]
     assert {"path tracing", "oidn", "whitened", "njs", "dsc", "pd"} <= errors.keys()
     image = methods.combine_frame(jax.random.key(0), glass_frame, "oidn", method="dsc")
-    r, noise = (i / glass_frame.exposure for i in glass_frame.reference)
-    image = image / glass_frame.exposure
+    r, noise = (i / glass_frame.median_luminance for i in glass_frame.reference)
+    image = image / glass_frame.median_luminance
     expected = metrics.rel_l2(image, r, half_difference=noise)
     np.testing.assert_allclose(errors["dsc"], expected, rtol=1e-3)
     table = learned.summary(rows)

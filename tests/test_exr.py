@@ -11,7 +11,7 @@ import pytest
 from jscomb import exr
 from jscomb.exr import files, own
 from jscomb.exr.files import Part, read_parts, write_parts
-from jscomb.frame import Biased, Reference, make_frame
+from jscomb.frame import Estimate, Reference, make_frame
 
 H, W = 12, 10
 
@@ -45,8 +45,8 @@ def frame():
         normal=noise(3, H, W, 3),
         depth=noise(4, 2, H, W, 1),
         samples=6,
-        biased={
-            "oidn": Biased(*map(jax.numpy.asarray, (color[0], color))),
+        estimates={
+            "oidn": Estimate(*map(jax.numpy.asarray, (color[0], color))),
             "smooth": color[1],
         },
         reference=Reference(*map(jax.numpy.asarray, noise(5, 2, H, W, 3))),
@@ -98,7 +98,7 @@ def test_sixteen_bits_on_request(frame, tmp_path):
 @pytest.mark.parametrize("name", ["a", "reference", "x.y", ""])
 def test_reserved_names(frame, tmp_path, name):
     with pytest.raises(ValueError, match="cannot be called"):
-        exr.write_frame(tmp_path / "x.exr", frame.with_biased(name, frame.color))
+        exr.write_frame(tmp_path / "x.exr", frame.with_estimate(name, frame.color))
     assert not list(tmp_path.iterdir())
 
 
@@ -131,7 +131,7 @@ def test_names_of_channels_and_attributes_have_checksums(frame, tmp_path):
 
 
 def test_version_1_is_read(frame, tmp_path):
-    plain = frame._replace(biased={}, reference=None)
+    plain = frame._replace(estimates={}, reference=None)
     exr.write_frame(tmp_path / "f.exr", plain)
     parts = read_parts(os.fspath(tmp_path / "f.exr"))
     path = own_file(tmp_path / "old.exr", parts, samples=6)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb.frame import Biased, Reference, make_frame
+from jscomb.frame import Estimate, Reference, make_frame
 from tests.statistics import assert_mean
 
 SHAPE = (4, 5, 3)
@@ -26,7 +26,7 @@ def frame():
         depth=random(4, 4, 4, 5, 1),
         visibility=random(5, 4, 4, 5, 1),
         samples=64,
-        biased={"smooth": Biased(random(6, *SHAPE), random(7, 2, *SHAPE))},
+        estimates={"smooth": Estimate(random(6, *SHAPE), random(7, 2, *SHAPE))},
         reference=Reference(random(8, *SHAPE), random(9, *SHAPE)),
     )
 
@@ -45,8 +45,8 @@ def test_halves_are_frames_with_halves(frame):
     np.testing.assert_allclose((a.variance + b.variance) / 4, frame.variance)
     np.testing.assert_allclose((a.albedo + b.albedo) / 2, frame.albedo)
     np.testing.assert_array_equal(a.normal, b.normal)
-    stored = frame.biased["smooth"].halves
-    np.testing.assert_array_equal(b.biased["smooth"].full, stored[1])
+    stored = frame.estimates["smooth"].halves
+    np.testing.assert_array_equal(b.estimates["smooth"].image, stored[1])
     assert (a.samples, a.sub_buffers, a.reference) == (32, 2, None)
     aa, ab = a.halves()
     np.testing.assert_allclose(aa.color, frame.buffers.color[0])
@@ -92,7 +92,7 @@ def test_is_a_pytree(frame):
     np.testing.assert_allclose(doubled.reference.image, 2 * frame.reference.image)
     np.testing.assert_array_equal(doubled.depth, frame.depth)
     stack = jax.tree.map(lambda *i: jnp.stack(i), frame, doubled)
-    exposures = jax.vmap(lambda f: f.exposure)(stack)
+    exposures = jax.vmap(lambda f: f.median_luminance)(stack)
     np.testing.assert_allclose(exposures[1], 2 * exposures[0])
     gradient = jax.grad(lambda f: f.color.sum())(frame)
     np.testing.assert_allclose(gradient.buffers.color, 0.25)
@@ -101,8 +101,8 @@ def test_is_a_pytree(frame):
 def test_nothing_is_mutable(frame):
     with pytest.raises(AttributeError):
         frame.samples = 3
-    assert "new" in frame.with_biased("new", frame.color).biased
-    assert "new" not in frame.biased
+    assert "new" in frame.with_estimate("new", frame.color).estimates
+    assert "new" not in frame.estimates
 
 
 @pytest.mark.parametrize("buffer", ["color", "variance", "albedo", "depth"])
@@ -115,8 +115,8 @@ def test_valid_sees_every_sub_buffer(frame, buffer):
 
 
 def test_valid_sees_halves_of_biased_images(frame):
-    halves = frame.biased["smooth"].halves.at[1, 0, 0, 0].set(jnp.nan)
-    assert not frame.with_biased("x", Biased(frame.color, halves)).valid[0, 0, 0]
+    halves = frame.estimates["smooth"].halves.at[1, 0, 0, 0].set(jnp.nan)
+    assert not frame.with_estimate("x", Estimate(frame.color, halves)).valid[0, 0, 0]
 
 
 def test_exposure_is_robust():
@@ -149,7 +149,7 @@ def test_plain_image_is_a_frame():
         ({"depth": np.ones(SHAPE)}, r"depth has shape .*\(1, 4, 5, 1\) or"),
         ({"biased": {"nlm": np.ones((4, 5, 1))}}, "biased image 'nlm' has shape"),
         (
-            {"biased": {"nlm": Biased(jnp.ones(SHAPE), jnp.ones(SHAPE))}},
+            {"biased": {"nlm": Estimate(jnp.ones(SHAPE), jnp.ones(SHAPE))}},
             "biased image 'nlm' of halves has shape",
         ),
         ({"samples": -3}, "samples must be positive, got -3"),

@@ -174,7 +174,7 @@ def test_unknown_names(glass_frame):
     key = jax.random.key(0)
     with pytest.raises(ValueError, match="no method 'gan'"):
         methods.combine_frame(key, glass_frame, "oidn", method="gan")
-    photons = glass_frame.with_biased("photons", glass_frame.color)
+    photons = glass_frame.with_estimate("photons", glass_frame.color)
     with pytest.raises(ValueError, match="pd needs a denoiser's derivative"):
         methods.combine_frame(key, photons, "photons", method="pd")
     with pytest.raises(ValueError, match=r"no biased image 'sppm'; there are \['oidn"):
@@ -187,10 +187,10 @@ def test_shipped_networks_help(method, glass_frame):
     if method == "pd" and not oidn.available():
         pytest.skip("needs Open Image Denoise")
     image = methods.combine_frame(jax.random.key(0), glass_frame, "oidn", method=method)
-    (r, noise), unit = glass_frame.reference, glass_frame.exposure
+    (r, noise), unit = glass_frame.reference, glass_frame.median_luminance
     noisy, denoised, found = (
         rel_l2(i / unit, r / unit, half_difference=noise / unit)
-        for i in (glass_frame.color, glass_frame.biased["oidn"].full, image)
+        for i in (glass_frame.color, glass_frame.estimates["oidn"].image, image)
     )
     assert found < noisy / 2
     assert found < 1.1 * denoised

@@ -180,7 +180,7 @@ def test_shapes_are_named(pair):
 
 
 def test_flip(glass_frame):
-    image, reference = glass_frame.biased["oidn"].full, glass_frame.reference.image
+    image, reference = glass_frame.estimates["oidn"].image, glass_frame.reference.image
     for flip in (metrics.flip, metrics.hdr_flip):
         better, worse = flip(image, reference), flip(glass_frame.color, reference)
         assert 0 < better < worse < 1

@@ -115,8 +115,8 @@ def stub_kernels(weights):
 @pytest.fixture
 def images(glass_frame):
     """x, y, y_a, y_b and variance, float64."""
-    y = glass_frame.biased["oidn"]
-    given = glass_frame.color, y.full, *y.halves, glass_frame.variance
+    y = glass_frame.estimates["oidn"]
+    given = glass_frame.color, y.image, *y.halves, glass_frame.variance
     return [i.astype(jnp.float64) for i in given]
 
 
@@ -252,7 +252,7 @@ def test_scale_equivariant(neural, scale, glass_frame):
         i[20:44, 20:44].astype(jnp.float64)
         for i in (
             glass_frame.color,
-            glass_frame.biased["oidn"].full,
+            glass_frame.estimates["oidn"].image,
             glass_frame.variance,
         )
     )
@@ -262,7 +262,7 @@ def test_scale_equivariant(neural, scale, glass_frame):
 
 def test_gradients_reach_every_parameter(neural, glass_frame):
     network, _, gradient = neural
-    images = glass_frame.color, glass_frame.biased["oidn"].full, glass_frame.variance
+    images = glass_frame.color, glass_frame.estimates["oidn"].image, glass_frame.variance
     _, (of_network, *_) = gradient(network, *images)
     for leaf in jax.tree.leaves(of_network):
         assert np.any(np.asarray(leaf) != 0)

@@ -111,8 +111,8 @@ def test_rdfc_of_a_frame():
     )
     plain, denoised = (rdfc.denoise_frame(f, window=11) for f in (bare, frame))
     x, v = frame.color, frame.variance
-    np.testing.assert_array_equal(plain.full, means(x, x, v, window=11))
-    assert error(denoised.full) < 0.3 * error(x)
+    np.testing.assert_array_equal(plain.image, means(x, x, v, window=11))
+    assert error(denoised.image) < 0.3 * error(x)
     for half, base in zip(frame.halves(), denoised.halves, strict=True):
         assert error(base) < 0.3 * error(half.color)
 
@@ -154,11 +154,11 @@ def test_nfor_lowers_the_error_of_a_real_frame():
     reference, noise = box_frame.reference
     error = lambda image: rel_l2(image, reference, half_difference=noise)
     denoised = nfor.denoise_frame(box_frame)
-    assert error(denoised.full) < 0.3 * error(box_frame.color)
+    assert error(denoised.image) < 0.3 * error(box_frame.color)
     assert error(denoised.halves[0]) < 0.3 * error(box_frame.halves()[0].color)
     for scale in (1e-6, 1e6):
-        other = nfor.denoise_frame(box_frame.scaled(scale)).full / scale
-        np.testing.assert_allclose(other, denoised.full, rtol=1e-3, atol=1e-5)
+        other = nfor.denoise_frame(box_frame.scaled(scale)).image / scale
+        np.testing.assert_allclose(other, denoised.image, rtol=1e-3, atol=1e-5)
 
 
 def test_nfor_is_consistent():
@@ -201,7 +201,7 @@ def test_nfor_of_a_bare_frame():
     given = make_frame(color[:4], variance=np.full((4, 9, 10, 3), 0.01))
     assert run(given).halves is not None
     good_half = color[4:, 4, 4].mean(axis=0)
-    np.testing.assert_allclose(eight.full[4, 4], good_half, rtol=1e-6)
+    np.testing.assert_allclose(eight.image[4, 4], good_half, rtol=1e-6)
 
 
 def test_nfor_survives_bad_pixels():

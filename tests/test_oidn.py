@@ -20,17 +20,17 @@ def denoised(glass_frame):
 def test_lowers_the_error_of_frame_and_halves(glass_frame, denoised):
     frame, reference = glass_frame, glass_frame.reference.image
     error = metrics.rel_l2
-    assert error(denoised.full, reference) < 0.3 * error(frame.color, reference)
+    assert error(denoised.image, reference) < 0.3 * error(frame.color, reference)
     for half, image in zip(frame.halves(), denoised.halves, strict=True):
         assert error(image, reference) < 0.3 * error(half.color, reference)
 
 
 def test_features_are_used(glass_frame, denoised):
     """Each changes the result; that it gets better is not promised."""
-    without = oidn.denoise_frame(glass_frame, features=False).full
+    without = oidn.denoise_frame(glass_frame, features=False).image
     only_albedo = oidn.denoise(glass_frame.color, albedo=glass_frame.albedo)
     assert jnp.abs(only_albedo - without).max() > 1e-3
-    assert jnp.abs(denoised.full - only_albedo).max() > 1e-3
+    assert jnp.abs(denoised.image - only_albedo).max() > 1e-3
 
 
 def test_frame_without_sub_buffers(glass_frame):
@@ -42,7 +42,7 @@ def test_frame_without_sub_buffers(glass_frame):
 def test_scale_equivariant(glass_frame, denoised, scale):
     """The bare filter is not, at radiance 1e-8."""
     scaled = oidn.denoise_frame(glass_frame.scaled(jnp.float32(scale)))
-    np.testing.assert_allclose(scaled.full, scale * denoised.full, rtol=1e-3)
+    np.testing.assert_allclose(scaled.image, scale * denoised.image, rtol=1e-3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -53,12 +53,12 @@ def test_a_bad_pixel_stays_local(glass_frame, denoised, bad):
         color,
         albedo=glass_frame.albedo,
         normal=glass_frame.normal,
-        exposure=glass_frame.exposure,
+        exposure=glass_frame.median_luminance,
     )
     assert np.isfinite(image).all()
     far = np.ones((64, 64), bool)
     far[20:41, 20:41] = False
-    np.testing.assert_allclose(image[far], denoised.full[far], rtol=0.1, atol=1e-3)
+    np.testing.assert_allclose(image[far], denoised.image[far], rtol=0.1, atol=1e-3)
 
 
 def test_nothing_finite_and_nothing_lit(glass_frame):
@@ -92,16 +92,16 @@ def test_it_is_a_jax_function(glass_frame, denoised):
     """Compiled, mapped, and with a forward derivative that is linear."""
     frame = glass_frame
     run = lambda x: oidn.denoise(
-        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.exposure
+        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.median_luminance
     )
     x = frame.color
     # Compiled, x / exposure is a product; the filter computes in half floats.
-    np.testing.assert_allclose(jax.jit(run)(x), denoised.full, rtol=2e-5)
+    np.testing.assert_allclose(jax.jit(run)(x), denoised.image, rtol=2e-5)
     both = jax.jit(jax.vmap(run))(jnp.stack([x, x[::-1]]))
-    np.testing.assert_allclose(both[0], denoised.full, rtol=2e-5)
+    np.testing.assert_allclose(both[0], denoised.image, rtol=2e-5)
     derivative = jax.jit(lambda x, t: jax.jvp(run, (x,), (t,)))
     y, moved = derivative(x, x)
-    np.testing.assert_allclose(y, denoised.full, rtol=2e-5)
+    np.testing.assert_allclose(y, denoised.image, rtol=2e-5)
     # Scaling the image scales the result, but for the filter's own nonlinearity.
     assert rel_l2(moved, y) < 0.05
     for scale in (1e-4, 1e4):
@@ -111,7 +111,7 @@ def test_it_is_a_jax_function(glass_frame, denoised):
 
 def test_sure_of_it_is_that_of_the_frame(glass_frame):
     """The mean estimate is the mean error, to a few percent, without a reference."""
-    frame = glass_frame.scaled(1 / glass_frame.exposure)
+    frame = glass_frame.scaled(1 / glass_frame.median_luminance)
     r, noise = frame.reference
     run = lambda x: oidn.denoise(x, albedo=frame.albedo, normal=frame.normal)
     risk = sure.monte_carlo_sure(

@@ -42,8 +42,8 @@ def test_sweep_measures_once(archive, glass_frame):
     found = {(r["combiner"], r["scale"]): r for r in records}
     assert found.keys() == {(name, scale) for name in FEW for scale in (1.0, 4.0)}
     r, noise = glass_frame.reference
-    y = glass_frame.biased["oidn"].full
-    unit = glass_frame.exposure
+    y = glass_frame.estimates["oidn"].image
+    unit = glass_frame.median_luminance
     wanted = metrics.rel_l2(y / unit, r / unit, half_difference=noise / unit)
     errors = found["oidn", 1.0]["errors"]
     np.testing.assert_allclose(errors["relative L2"], [wanted], rtol=1e-4)
@@ -192,8 +192,8 @@ def test_regret_is_relative_to_the_least(folder):
 
 def test_changes_of_pixels_add_up(glass_frame):
     """What was removed less what was added is the change of the mean error."""
-    frame = glass_frame.scaled(1 / glass_frame.exposure)
-    r, y = frame.reference.image, frame.biased["oidn"].full
+    frame = glass_frame.scaled(1 / glass_frame.median_luminance)
+    r, y = frame.reference.image, frame.estimates["oidn"].image
     same = pixels.changed(y, frame)
     assert same[1:] == (0, 0, 0, 0)
     perfect = pixels.changed(r, frame)

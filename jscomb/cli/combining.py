@@ -16,7 +16,7 @@ import jscomb
 from jscomb import choice, exr
 from jscomb.cli import tables
 from jscomb.denoisers import oidn
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 from jscomb.numerics import tiles
 from jscomb.typing import Image
 
@@ -130,7 +130,7 @@ def _combine_file(path: Path, out: Path, asked: _Asked) -> None:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     name, image = _biased_image(path, loaded, asked.biased)
-    whole = loaded.with_biased(name, image)
+    whole = loaded.with_estimate(name, image)
     automatic = asked.method == "auto"
     chosen = choose(whole, name, asked.budget) if automatic else asked.method
     try:
@@ -149,7 +149,7 @@ def _combine_file(path: Path, out: Path, asked: _Asked) -> None:
     exr.write_image(out, combined, provenance=about)
     print(f"wrote {out}: {tables.size(loaded)}, {name} {chosen}")
     if loaded.reference is not None:
-        images = {"input": loaded.color, name: image.full, chosen: combined}
+        images = {"input": loaded.color, name: image.image, chosen: combined}
         tables.print_table({"relative L2": tables.errors(images, loaded)})
 
 
@@ -200,11 +200,11 @@ def _said(trial: choice.Trial) -> str:
     return f"adds {mean:+.2g} +- {error:.1g} relative L2{late}"
 
 
-def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Biased]:
+def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Estimate]:
     """Name and image of what to combine with."""
-    held = ", ".join(frame.biased) or "none"
-    if choice in frame.biased:
-        return choice, frame.biased[choice]
+    held = ", ".join(frame.estimates) or "none"
+    if choice in frame.estimates:
+        return choice, frame.estimates[choice]
     if choice is not None:
         if not os.path.exists(choice):
             raise ValueError(
@@ -214,10 +214,10 @@ def _biased_image(path: Path, frame: Frame, choice: str | None) -> tuple[str, Bi
         image = exr.read_image(choice)
         if image.shape != frame.color.shape:
             raise ValueError(f"{choice} is {image.shape}, {path} {frame.color.shape}")
-        return Path(choice).name, Biased(image)
-    if len(frame.biased) > 1:
+        return Path(choice).name, Estimate(image)
+    if len(frame.estimates) > 1:
         raise ValueError(f"{path} holds several biased images, choose --biased: {held}")
-    for name, image in frame.biased.items():
+    for name, image in frame.estimates.items():
         return name, image
     if not oidn.available():
         raise ImportError(

@@ -115,11 +115,11 @@ def info(frame: FramePath, /, *, samples: SampleCount = None) -> None:
     spp = tables.samples(loaded)
     print(f"  samples         {spp} a pixel in {count} sub-buffer(s)")
     print(f"  invalid pixels  {invalid}")
-    print(f"  exposure        {float(loaded.exposure):.4g} (median radiance)")
+    print(f"  exposure        {float(loaded.median_luminance):.4g} (median radiance)")
     stored: dict[str, Any] = {
         n: b for n, b in loaded.buffers._asdict().items() if b is not None
     }
-    stored |= {f"biased {name}": b.full for name, b in loaded.biased.items()}
+    stored |= {f"biased {name}": b.image for name, b in loaded.estimates.items()}
     if loaded.reference is not None:
         stored["reference"] = loaded.reference.image
     for name, buffer in stored.items():

@@ -6,4 +6,3 @@ from jscomb.denoisers import nonlocal_means as nonlocal_means
 from jscomb.denoisers import oidn as oidn
 from jscomb.denoisers import rdfc as rdfc
 from jscomb.denoisers import smoothing as smoothing
-from jscomb.denoisers.parts import of_parts as of_parts

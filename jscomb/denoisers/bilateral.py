@@ -12,15 +12,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.denoisers.parts import of_parts
 from jscomb.features import stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.tiles import compiled
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Variance
 
 _POOL = 3  # width that the guide and its variance are averaged over
+
+
+NEEDS = Needs(variance=True)
 
 
 def denoise(
@@ -78,11 +81,7 @@ def denoise(
     return jnp.where(finite(variance), filtered, first_finite(image))
 
 
-# Called with values, a loop over tiles would be compiled anew each time.
-_denoise = jax.jit(denoise, static_argnames="window")
-
-
-def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
+def denoise_frame(frame: Frame, *, window: int = 21) -> Estimate:
     """Denoise a frame with the features it has, and each of its halves by itself.
 
     Args:
@@ -101,10 +100,10 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
         >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
         >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
         >>> made = denoise_frame(frame, window=9)
-        >>> print([f"{i.std():.2f}" for i in (frame.color, made.full, made.halves)])
+        >>> print([f"{i.std():.2f}" for i in (frame.color, made.image, made.halves)])
         ['0.36', '0.05', '0.06']
     """
-    return of_parts(
-        frame,
-        lambda part: _denoise(part.color, part.variance, stack(part), window=window),
-    )
+    frame.require("bilateral", NEEDS)
+    run = compiled(denoise, window=window)
+    one = lambda part: run(part.color, part.variance, stack(part))
+    return with_halves(frame, one, needs=NEEDS)

@@ -23,11 +23,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.denoisers import nonlocal_means
-from jscomb.denoisers.parts import of_parts
 from jscomb.features import select, stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
 from jscomb.numerics.regression import joint_local_linear
+from jscomb.numerics.tiles import compiled
 from jscomb.numerics.windows import window_mean, window_sum
 from jscomb.typing import Image, Scalar, Variance
 
@@ -38,6 +38,9 @@ Halves = Float[Array, "2 h w c"]
 _POOL = 3  # width that sample variances are averaged over: as they are they mislead
 _FEATURE_WINDOW, _FEATURE_STRENGTH = 11, 1.0  # of the features' pre-filter
 _LEAST = 1e-4  # of the mean square radiance; keeps black pixels from deciding
+
+
+NEEDS = Needs(variance=True, halves=True)
 
 
 def denoise(
@@ -200,12 +203,7 @@ def filter_features(features_a: Features, features_b: Features) -> tuple[Image, 
     return across(features_a, features_b), across(features_b, features_a)
 
 
-# Called with values, a loop over tiles would be compiled anew each time.
-_denoise = jax.jit(denoise, static_argnames=("window", "stride"))
-_filter_features = jax.jit(filter_features)
-
-
-def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
+def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Estimate:
     """Denoise a frame from its two halves, and each half by itself if it has halves.
 
     Leaves out features that tell nothing, so it is not for `jit`.
@@ -229,11 +227,12 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
         >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 8, 8, 1))
         >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
         >>> made = denoise_frame(frame, window=5)
-        >>> print(f"{frame.color.std():.2f} {made.full.std():.2f}", made.halves)
+        >>> print(f"{frame.color.std():.2f} {made.image.std():.2f}", made.halves)
         0.31 0.03 None
     """
+    frame.require("nfor", NEEDS)
     one = lambda part: _denoise_whole(part, window, stride)
-    return of_parts(frame, one, halves=True)
+    return with_halves(frame, one, needs=NEEDS)
 
 
 def _denoise_whole(frame: Frame, window: int, stride: int) -> Image:
@@ -241,15 +240,13 @@ def _denoise_whole(frame: Frame, window: int, stride: int) -> Image:
     a, b = frame.halves()
     stacks = stack(a), stack(b)
     needed = select(stacks)
-    features = _filter_features(*(needed.of(s) for s in stacks))
-    both = _denoise(
+    features = compiled(filter_features)(*(needed.of(s) for s in stacks))
+    both = compiled(denoise, window=window, stride=stride)(
         a.color,
         b.color,
         a.variance,
         b.variance,
         *features,
-        window=window,
-        stride=stride,
         ridge=jnp.asarray(needed.ridge(0.1), frame.color.dtype),
     )
     return (both[0] + both[1]) / 2

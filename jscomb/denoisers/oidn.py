@@ -20,12 +20,12 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import ArrayLike
 
-from jscomb.denoisers.parts import of_parts
-from jscomb.frame import Biased, Frame, make_frame
+from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import finite
+from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.windows import window_max, window_mean
 
-_LARGEST = 1e5  # radiance over exposure; beyond, the filter's half floats overflow
+_LARGEST = 1e5  # normalised radiance; beyond, the filter's half floats overflow
 _STEP = 0.03  # of a difference, relative to the typical pixel
 
 
@@ -42,12 +42,14 @@ def available() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
+NEEDS = Needs(channels=3, normalised=True, extra="oidn", package="pyoidn")
+
+
 def denoise(
     color: ArrayLike,
     *,
     albedo: ArrayLike | None = None,
     normal: ArrayLike | None = None,
-    exposure: ArrayLike | None = None,
 ) -> Array:
     """Denoise one image.
 
@@ -55,8 +57,6 @@ def denoise(
         color: linear radiance, shape [H,W,3]; may hold pixels that are not finite.
         albedo: shape [H,W,3], clipped to [0, 1] here; optional.
         normal: shape [H,W,3], components in [-1, 1]; optional, needs `albedo`.
-        exposure: a radiance typical of the image, such as `Frame.exposure`; computed
-            from `color` if None.
 
     Returns:
         the denoised image, linear radiance, finite, float32, shape [H,W,3].
@@ -71,24 +71,61 @@ def denoise(
         >>> if available():
         ...     assert jax.jit(denoise)(noisy).std() < 0.1 * noisy.std()
     """
-    if not available():
-        raise ImportError('Open Image Denoise is missing: pip install "jscomb[oidn]"')
-    image = jnp.asarray(color, jnp.float32)
-    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise ValueError(f"color must have shape [H,W,3], got {image.shape}")
+    image = _checked(color)
+    unit = median_luminance(image)
+    return unit * denoise_normalised(image / unit, albedo=albedo, normal=normal)
+
+
+def denoise_normalised(
+    color: ArrayLike,
+    *,
+    albedo: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+) -> Array:
+    """Denoise one image of a median luminance of one.
+
+    Unlike `denoise` it does not normalise, so the unit does not follow the noise: for
+    derivatives, and for halves or crops of a normalised frame.
+
+    Args:
+        color: normalised radiance, shape [H,W,3]; may hold pixels that are not finite.
+        albedo: shape [H,W,3], clipped to [0, 1] here; optional.
+        normal: shape [H,W,3], components in [-1, 1]; optional, needs `albedo`.
+
+    Returns:
+        the denoised image, normalised radiance, finite, float32, shape [H,W,3].
+
+    Raises:
+        ImportError: if Open Image Denoise is not installed; says how to install it.
+        ValueError: if a shape is wrong, or a normal comes without an albedo.
+        RuntimeError: if the filter reports a failure.
+
+    Example:
+        >>> noisy = jax.random.exponential(jax.random.key(0), (32, 32, 3), jnp.float32)
+        >>> if available():
+        ...     assert jax.jit(denoise_normalised)(noisy).std() < 0.1 * noisy.std()
+    """
+    image = _checked(color)
     if normal is not None and albedo is None:
         raise ValueError("normal needs albedo: Open Image Denoise takes both or albedo")
     features = {}
-    for name, feature, least in (("albedo", albedo, 0.0), ("normal", normal, -1.0)):
+    for name, feature, minimum in (("albedo", albedo, 0.0), ("normal", normal, -1.0)):
         if feature is not None:
             clean = _fill(jnp.asarray(feature, jnp.float32))
             if clean.shape != image.shape:
                 raise ValueError(f"{name} has shape {clean.shape}, not {image.shape}")
-            features[name] = jnp.clip(clean, least, 1.0)
-    scale = make_frame(image).exposure if exposure is None else jnp.asarray(exposure)
-    scale = scale.astype(jnp.float32)
-    scaled = jnp.clip(_fill(image) / scale, 0.0, _LARGEST)
-    return _filter(scaled, features) * scale
+            features[name] = jnp.clip(clean, minimum, 1.0)
+    return _filter(jnp.clip(_fill(image), 0.0, _LARGEST), features)
+
+
+def _checked(color: ArrayLike) -> Array:
+    """The image in float32, if the filter can denoise it."""
+    if missing := NEEDS.missing_package():
+        raise ImportError(f"Open Image Denoise needs {missing}")
+    image = jnp.asarray(color, jnp.float32)
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise ValueError(f"color must have shape [H,W,3], got {image.shape}")
+    return image
 
 
 @jax.custom_jvp
@@ -130,37 +167,38 @@ def _filter_jvp(
     return _filter(*primals), (at(1.0) - at(-1.0)) / (2 * step)
 
 
-def denoise_frame(frame: Frame, *, features: bool = True) -> Biased:
-    """Denoise a frame, and each of its halves by itself where it has sub-buffers.
+def denoise_frame(frame: Frame, *, features: bool = True) -> Estimate:
+    """Denoise a normalised frame, and each of its halves by itself.
 
     Args:
-        frame: with colour of three channels; its albedo and normal guide the filter.
+        frame: normalised, with colour of three channels; its albedo and normal guide
+            the filter.
         features: use them.
 
     Returns:
-        the denoised full frame, and halves (None if the frame has no sub-buffers).
+        the denoised frame, normalised radiance.
 
     Raises:
         ImportError: if Open Image Denoise is not installed.
-        ValueError: if the colour does not have three channels.
+        ValueError: if the frame is not normalised or does not have three channels.
         RuntimeError: if the filter reports a failure.
 
     Example:
+        >>> from jscomb.frame import make_frame
         >>> shape = 2, 32, 32, 3
         >>> noise = jax.random.exponential(jax.random.key(0), shape, jnp.float32)
         >>> if available():
-        ...     made = denoise_frame(make_frame(noise))
-        ...     assert made.full.std() < made.halves.std() < 0.1 * noise.std()
+        ...     made = denoise_frame(make_frame(noise).normalised())
+        ...     assert made.image.std() < made.halves.std() < 0.1 * noise.std()
     """
+    frame.require("oidn", NEEDS)
 
     def one(part: Frame) -> Array:
         albedo = part.albedo if features else None
         normal = None if albedo is None else part.normal
-        return denoise(
-            part.color, albedo=albedo, normal=normal, exposure=frame.exposure
-        )
+        return denoise_normalised(part.color, albedo=albedo, normal=normal)
 
-    return of_parts(frame, one, variance=False)
+    return with_halves(frame, one, needs=NEEDS)
 
 
 def _fill(image: Array) -> Array:

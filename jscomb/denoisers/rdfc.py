@@ -15,12 +15,15 @@ import jax
 from jaxtyping import Array, Float
 
 from jscomb.denoisers import nonlocal_means
-from jscomb.denoisers.parts import of_parts
 from jscomb.features import stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape
+from jscomb.numerics.tiles import compiled
 from jscomb.numerics.weights import feature_weights, least_of, weighted_mean
 from jscomb.typing import Image, Variance
+
+
+NEEDS = Needs(variance=True)
 
 
 def denoise(
@@ -75,11 +78,7 @@ def denoise(
     return weighted_mean(image, alike, window=window)
 
 
-# Called with values, a loop over tiles would be compiled anew each time.
-_denoise = jax.jit(denoise, static_argnames="window")
-
-
-def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
+def denoise_frame(frame: Frame, *, window: int = 21) -> Estimate:
     """Denoise a frame with its albedo, normal and depth, and each of its halves.
 
     Any of them may be missing; visibility is not used.
@@ -100,15 +99,17 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Biased:
         >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
         >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
         >>> made = denoise_frame(frame, window=9)
-        >>> print([f"{i.std():.2f}" for i in (frame.color, made.full, made.halves)])
+        >>> print([f"{i.std():.2f}" for i in (frame.color, made.image, made.halves)])
         ['0.36', '0.06', '0.09']
     """
+
+    frame.require("rdfc", NEEDS)
 
     def one(part: Frame) -> Image:
         # Visibility is a Monte Carlo estimate; its noise would pass for edges.
         buffers = part.buffers._replace(visibility=None)
         features = stack(part._replace(buffers=buffers))
         x, v = part.color, part.variance
-        return _denoise(x, x, v, features, window=window)
+        return compiled(denoise, window=window)(x, x, v, features)
 
-    return of_parts(frame, one)
+    return with_halves(frame, one, needs=NEEDS)

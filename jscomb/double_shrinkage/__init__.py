@@ -20,7 +20,7 @@ made of the other (`radiance_prior`). Without a network the confidence comes fro
 `confidence`, and the error of b from halves (`biased_error`) or from passes of unlike
 radii (`radius_bias`). `combine_frame` does all that.
 
-Source: C. Zhou et al., "DSCombiner: Double Shrinkage for Combining Biased and Unbiased
+Source: C. Zhou et al., "DSCombiner: Double Shrinkage for Combining Estimate and Unbiased
 Monte Carlo Renderings", 2025 (DSC; eq. numbers above).
 """
 

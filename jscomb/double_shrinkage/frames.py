@@ -61,10 +61,10 @@ def combine_frame(
 
     Example:
         >>> import numpy as np
-        >>> from jscomb.frame import Biased, make_frame
+        >>> from jscomb.frame import Estimate, make_frame
         >>> x = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
         >>> y = jnp.full((2, 16, 16, 1), 1.2)
-        >>> frame = make_frame(x, variance=0 * x + 0.25, biased={"y": Biased(y[0], y)})
+        >>> frame = make_frame(x, variance=0 * x + 0.25, estimates={"y": Estimate(y[0], y)})
         >>> image = combine_frame(frame, "y", window=11).image
         >>> for made in (frame.color, y[0], image):
         ...     print(f"{jnp.sqrt(jnp.mean((made - 1) ** 2)):.3f}")
@@ -75,20 +75,20 @@ def combine_frame(
     Source: DSC, with `confidence` and `biased_error` for its network's part, and the
     prior of the first blend.
     """
-    halves = frame.biased[name].halves if name in frame.biased else None
+    halves = frame.estimates[name].halves if name in frame.estimates else None
     if halves is None:
-        has = [n for n, image in frame.biased.items() if image.halves is not None]
+        has = [n for n, image in frame.estimates.items() if image.halves is not None]
         raise ValueError(f"no biased image {name!r} with halves; there are {has}")
     a, b = frame.halves()
     features = stack(frame)
     needed = select([features])
     return _combined(
         jnp.stack([frame.color, a.color, b.color]),
-        jnp.stack([frame.biased[name].full, *halves]),
+        jnp.stack([frame.estimates[name].image, *halves]),
         frame.variance,
         needed.of(features),
         jnp.asarray(needed.ridge(_RIDGE), features.dtype),
-        frame.exposure,
+        frame.median_luminance,
         window=window,
         stride=stride,
     )

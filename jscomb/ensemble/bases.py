@@ -1,4 +1,4 @@
-"""Biased images of a frame, stacked for an ensemble."""
+"""Estimate images of a frame, stacked for an ensemble."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jscomb.ensemble.errors import Bases
-from jscomb.frame import Biased
+from jscomb.frame import Estimate
 
 
 class Stacked(NamedTuple):
@@ -23,7 +23,7 @@ class Stacked(NamedTuple):
     biased_b: Bases
 
 
-def stack_bases(bases: Mapping[str, Biased]) -> Stacked:
+def stack_bases(bases: Mapping[str, Estimate]) -> Stacked:
     """Stack biased images and those of the halves.
 
     Args:
@@ -37,20 +37,20 @@ def stack_bases(bases: Mapping[str, Biased]) -> Stacked:
 
     Example:
         >>> y = jnp.ones((4, 5, 3))
-        >>> stacked = stack_bases({"oidn": Biased(y, jnp.stack([y, y]))})
+        >>> stacked = stack_bases({"oidn": Estimate(y, jnp.stack([y, y]))})
         >>> print(*(images.shape for images in stacked))
         (1, 4, 5, 3) (1, 4, 5, 3) (1, 4, 5, 3)
     """
     if not bases:
         raise ValueError("an ensemble needs at least one base, got none")
     first, *_ = bases
-    shape = bases[first].full.shape
+    shape = bases[first].image.shape
     for name, base in bases.items():
         if base.halves is None:
             raise ValueError(f"base {name!r} was not made from each half too")
-        if base.full.shape != shape:
+        if base.image.shape != shape:
             raise ValueError(
-                f"base {name!r} has shape {base.full.shape}, {first!r} has {shape}"
+                f"base {name!r} has shape {base.image.shape}, {first!r} has {shape}"
             )
         if base.halves.shape != (2, *shape):
             raise ValueError(

@@ -73,7 +73,7 @@ def read_frame(
 
     Example:
         >>> frame = read_frame(bundled()["cornell-glass-64"])
-        >>> print(frame.color.shape, frame.samples, list(frame.biased))
+        >>> print(frame.color.shape, frame.samples, list(frame.estimates))
         (192, 192, 3) 64.0 ['oidn']
     """
     path = os.fspath(path)

@@ -24,7 +24,7 @@ import numpy as np
 from jax import Array
 
 from jscomb.exr.files import Part, stack
-from jscomb.frame import Biased, Frame, Reference, make_frame
+from jscomb.frame import Estimate, Frame, Reference, make_frame
 
 ATTRIBUTE = "jscomb"
 PROVENANCE = "provenance"
@@ -82,14 +82,14 @@ def to_parts(
         return channels
 
     parts = {LETTERS[number]: sub_buffer(number) for number in range(k)}
-    for name, image in frame.biased.items():
+    for name, image in frame.estimates.items():
         if name in parts or name == "reference" or "." in name or not name:
             raise ValueError(
                 f"a biased image cannot be called {name!r} in a file: sub-buffers are "
                 f"called {', '.join(LETTERS[:k])}, the reference `reference`, halves "
                 "have a dot"
             )
-        parts[name] = pixels("biased", image.full, "", "RGB")
+        parts[name] = pixels("biased", image.image, "", "RGB")
         for number, part in enumerate([] if image.halves is None else image.halves):
             parts[f"{name}.{LETTERS[number]}"] = pixels(
                 "biased_halves", part, "", "RGB"
@@ -158,7 +158,7 @@ def from_parts(parts: list[Part], samples: int | None, statistics: bool) -> Fram
             buffers[name] = np.stack(present)
     names = [n for n in by_name if "." not in n and n not in (*letters, "reference")]
     biased = {
-        name: Biased(
+        name: Estimate(
             rgb(name),
             jnp.stack([rgb(f"{name}.a"), rgb(f"{name}.b")])
             if {f"{name}.a", f"{name}.b"} <= by_name.keys()
@@ -175,7 +175,7 @@ def from_parts(parts: list[Part], samples: int | None, statistics: bool) -> Fram
     return make_frame(
         jnp.stack([rgb(letter) for letter in letters]),
         samples=about.get("samples") if samples is None else samples,
-        biased=biased,
+        estimates=biased,
         reference=reference,
         **buffers,
     )

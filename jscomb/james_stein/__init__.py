@@ -7,7 +7,7 @@ pays.
 
 Source:
     J. Gu, J. Iglesias-Guitian, B. Moon, "Neural James-Stein Combiner for Unbiased and
-    Biased Renderings", 2022 (NJS).
+    Estimate Renderings", 2022 (NJS).
 """
 
 from jscomb.james_stein.neural import Parameters as Parameters

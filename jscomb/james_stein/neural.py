@@ -1,5 +1,6 @@
 """James-Stein combination with a network's variances."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -7,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.james_stein.shrinkage import combine
-from jscomb.numerics.exposure import in_units
-from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
 from jscomb.numerics.kernels import Kernels, predicted_mean
-from jscomb.typing import Image, Scalar, Variance
+from jscomb.numerics.luminance import at_unit_luminance
+from jscomb.typing import Image, Variance
 
 
 class Parameters(NamedTuple):
@@ -38,15 +39,15 @@ def neural_combine(
     window: int = 15,
     kernel_window: int = 15,
     whiten: bool = False,
-    exposure: Scalar | None = None,
 ) -> Image:
-    """Shrink towards the better regression by the variance that a network makes out.
+    """Shrink towards the regressed image by the variance that a network estimates.
 
     Pure, scale-equivariant, and differentiable in every array and in the network's
     parameters. The network's w² weights a pixel exist for a strip of rows at a time.
+    Radiance is divided by the median luminance of x before, and scaled back after.
 
     Args:
-        network: of x, v, y^_a and y^_b, finite and at an exposure of one, such as
+        network: of x, v, y^_a and y^_b, finite and normalised, such as
             `learning.networks.JamesSteinNetwork`.
         unbiased: x, linear radiance, shape [H,W,C].
         biased_a: y^_a of `cross_regression`, likewise; or the biased image itself.
@@ -57,7 +58,6 @@ def neural_combine(
         kernel_window: width of the network's kernels in pixels, odd.
         whiten: allow each pixel its own variance within a window: the greater of its
             sample variance and what the network makes of its neighbourhood.
-        exposure: what to divide radiance by; None for `numerics.exposure` of x.
 
     Returns:
         the combined rendering, linear radiance, shape [H,W,C]; at an invalid pixel the
@@ -80,15 +80,67 @@ def neural_combine(
     check_same_shape(
         unbiased=unbiased, biased_a=biased_a, biased_b=biased_b, variance=variance
     )
-    valid = finite(unbiased, biased_a, biased_b, variance)
-    unit, x, a, b, v = in_units(
-        exposure, valid, unbiased, biased_a, biased_b, variance=variance
+    combine_normalised = functools.partial(
+        neural_combine_normalised,
+        network,
+        window=window,
+        kernel_window=kernel_window,
+        whiten=whiten,
     )
+    images = unbiased, biased_a, biased_b
+    return at_unit_luminance(combine_normalised, *images, squares=[variance])
+
+
+def neural_combine_normalised(
+    network: Network,
+    unbiased: Image,
+    biased_a: Image,
+    biased_b: Image,
+    variance: Variance,
+    *,
+    window: int = 15,
+    kernel_window: int = 15,
+    whiten: bool = False,
+) -> Image:
+    """Shrink normalised images; for crops of a normalised frame, and for training.
+
+    Local, and not scale-equivariant: `neural_combine` without its normalisation.
+
+    Args:
+        network: as for `neural_combine`.
+        unbiased: x, normalised radiance, shape [H,W,C].
+        biased_a: y^_a, likewise.
+        biased_b: y^_b, likewise.
+        variance: of the mean x, at least zero, likewise.
+        window: width of the windows that are shrunk, in pixels, odd, at least three.
+        kernel_window: width of the network's kernels in pixels, odd.
+        whiten: allow each pixel its own variance within a window.
+
+    Returns:
+        the combined rendering, normalised radiance, shape [H,W,C]; at an invalid pixel
+        the first finite of (y^_a, y^_b, x), else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, or the network has other kernels.
+
+    Example:
+        >>> x, y = jnp.full((4, 4, 1), 3.0), jnp.ones((4, 4, 1))
+        >>> even = Kernels(x, lambda near: jnp.ones((*near.shape[:2], 15**2)), 0)
+        >>> network = lambda *_: Parameters(even, 0.5 * y)
+        >>> print(neural_combine_normalised(network, x, y, y, y, window=3)[0, 0].round(3))
+        [2.674]
+
+    Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.
+    """
+    check_same_shape(
+        unbiased=unbiased, biased_a=biased_a, biased_b=biased_b, variance=variance
+    )
+    valid, x, a, b, v = zero_invalid(unbiased, biased_a, biased_b, variance)
     parameters = network(x, v, a, b)
     (s2,) = predicted_mean(v[None], parameters.kernels, kernel_window, mask=valid)
     if whiten:
         s2 = jnp.maximum(v, s2)
     y = parameters.share * a + (1 - parameters.share) * b
-    # Where something is missing nothing is combined, nor does it count for others.
+    # An invalid pixel is not combined, and excluded from its neighbours' windows.
     shrunk = combine(x, y, jnp.where(valid, s2, jnp.nan), window=window, whiten=whiten)
-    return jnp.where(valid, unit * shrunk, first_finite(biased_a, biased_b, unbiased))
+    return jnp.where(valid, shrunk, first_finite(biased_a, biased_b, unbiased))

@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jscomb.features import select, stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 from jscomb.metrics import Change, mean_change
 from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
 from jscomb.numerics.medians import median
@@ -316,12 +316,12 @@ class Regressed(NamedTuple):
     """A frame's biased image after regression, if that pays.
 
     Attributes:
-        biased: y* and its halves y^_a and y^_b; or the image as it was.
+        estimate: y* and its halves y^_a and y^_b; or the image as it was.
         change: of the relative L2, estimated; negative where regression pays.
-        ran: whether `biased` is regressed.
+        ran: whether `estimate` is regressed.
     """
 
-    biased: Biased
+    estimate: Estimate
     change: Change
     ran: bool
 
@@ -365,17 +365,17 @@ def regress(
         >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
         >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
         >>> flat = np.full_like(noise, 0.5)
-        >>> biased = {"flat": Biased(jnp.asarray(flat[0]), jnp.asarray(flat))}
+        >>> biased = {"flat": Estimate(jnp.asarray(flat[0]), jnp.asarray(flat))}
         >>> frame = make_frame(ramp + noise, depth=ramp, biased=biased)
         >>> found = regress(jax.random.key(0), frame, "flat", window=9)
         >>> print(f"{found.change.mean:.1f} {found.ran}")
         -0.2 True
     """
-    halves = frame.biased[name].halves if name in frame.biased else None
+    halves = frame.estimates[name].halves if name in frame.estimates else None
     if halves is None:
-        has = [n for n, image in frame.biased.items() if image.halves is not None]
+        has = [n for n, image in frame.estimates.items() if image.halves is not None]
         raise ValueError(f"no biased image {name!r} with halves; there are {has}")
-    exposure = frame.exposure
+    exposure = frame.median_luminance
     a, b = frame.halves()
     needed = select([stack(a), stack(b)])
     xa, xb, ya, yb = (i / exposure for i in (a.color, b.color, *halves))
@@ -389,10 +389,10 @@ def regress(
         key, xa, xb, ya, yb, fa, fb, va, vb, stride=coarse, **options
     )
     if not (always or change.helps):
-        return Regressed(frame.biased[name], change, ran=False)
+        return Regressed(frame.estimates[name], change, ran=False)
     both = _cross_regression(xa, xb, ya, yb, fa, fb, stride=stride, **options)
     halves = exposure * jnp.stack(both)
-    return Regressed(Biased(jnp.mean(halves, axis=0), halves), change, ran=True)
+    return Regressed(Estimate(jnp.mean(halves, axis=0), halves), change, ran=True)
 
 
 def _variance(half: Frame, other: Frame) -> Variance:

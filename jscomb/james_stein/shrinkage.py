@@ -35,7 +35,7 @@ are not finite in x, y or v take no part in any window; see `numerics.guards`.
 
 Sources:
     J. Gu, J. Iglesias-Guitian, B. Moon, "Neural James-Stein Combiner for Unbiased and
-    Biased Renderings", 2022 (NJS; eq. numbers below).
+    Estimate Renderings", 2022 (NJS; eq. numbers below).
     W. James, C. Stein, "Estimation with quadratic loss", 1961.
     A. Baranchik, "Multiple regression and estimation of the mean of a multivariate
     normal distribution", 1964 (the positive part).

@@ -2,9 +2,9 @@
 
 from jscomb.numerics import cholesky as cholesky
 from jscomb.numerics import convolution as convolution
-from jscomb.numerics import exposure as exposure
 from jscomb.numerics import guards as guards
 from jscomb.numerics import kernels as kernels
+from jscomb.numerics import luminance as luminance
 from jscomb.numerics import medians as medians
 from jscomb.numerics import poisson as poisson
 from jscomb.numerics import regression as regression

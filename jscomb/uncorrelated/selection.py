@@ -311,7 +311,7 @@ def combine_frames(
     )
     if of_y != of_z:
         raise ValueError(f"correlated has {of_z} samples, independent has {of_y}")
-    return _combined(y, z, independent.exposure, of_y, window=window)
+    return _combined(y, z, independent.median_luminance, of_y, window=window)
 
 
 def _quarters(name: str, frame: Frame) -> tuple[SubAverages, Scalar]:

@@ -84,7 +84,7 @@ def pd(path: str, asked: Asked) -> Arguments:
         found["variance"] = stack(part, "Variance", "RGB")
     beside = f"{name}.den.exr"
     if os.path.isfile(beside):
-        found["biased"] = {"denoised": any_image(single(beside, asked), "")}
+        found["estimates"] = {"denoised": any_image(single(beside, asked), "")}
     return found
 
 

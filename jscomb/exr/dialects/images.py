@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jscomb.exr.files import MAX_BYTES, Part, read_parts, stack
-from jscomb.frame import Biased
+from jscomb.frame import Estimate
 
 Arguments = dict[str, Any]  # of make_frame
 
@@ -86,7 +86,7 @@ def any_image(part: Part, layer: str) -> np.ndarray:
     return rgb(part, layer)  # raises: says what is there
 
 
-def biased(full: np.ndarray, halves: np.ndarray | None) -> Biased:
+def biased(full: np.ndarray, halves: np.ndarray | None) -> Estimate:
     """A biased image as arrays of JAX.
 
     Args:
@@ -96,7 +96,7 @@ def biased(full: np.ndarray, halves: np.ndarray | None) -> Biased:
     Returns:
         the image.
     """
-    return Biased(jnp.asarray(full), None if halves is None else jnp.asarray(halves))
+    return Estimate(jnp.asarray(full), None if halves is None else jnp.asarray(halves))
 
 
 def finite_depth(depth: np.ndarray) -> np.ndarray:

@@ -156,7 +156,7 @@ def tungsten(path: str, asked: Asked) -> Arguments:
             found[name] = finite_depth(feature) if name == "depth" else feature
     if asked.statistics:
         found["variance"] = image("colorVariance")
-    found["biased"] = {
+    found["estimates"] = {
         name: biased(full, halves(name, name))
         for name in sorted(os.listdir(path))
         if os.path.isdir(os.path.join(path, name))
@@ -196,7 +196,7 @@ def blender(path: str, asked: Asked) -> Arguments:
 
     noisy = image("Noisy Image", "Denoising Image")
     if noisy is not None:
-        found |= {"color": noisy, "biased": {"denoised": combined}}
+        found |= {"color": noisy, "estimates": {"denoised": combined}}
     albedo = image("Denoising Albedo", "DiffCol")
     normal = image("Denoising Normal", "Normal")
     depth = image("Denoising Depth", "Depth")

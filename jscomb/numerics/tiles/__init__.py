@@ -14,3 +14,4 @@ from jscomb.numerics.tiles.neighbourhoods import flat as flat
 from jscomb.numerics.tiles.neighbourhoods import fold_rows as fold_rows
 from jscomb.numerics.tiles.neighbourhoods import map_rows as map_rows
 from jscomb.numerics.tiles.neighbourhoods import sum_over_tiles as sum_over_tiles
+from jscomb.numerics.tiles.programs import compiled as compiled

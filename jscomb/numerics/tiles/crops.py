@@ -37,6 +37,10 @@ class Local(NamedTuple):
     halo: int
     multiple: int = 1
 
+    def whole(self) -> Any:
+        """Return the function's result for the whole images."""
+        return self.function(self.images)
+
 
 class Span(NamedTuple):
     """A tile and its crop along one axis, in pixels.
