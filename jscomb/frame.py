@@ -429,18 +429,37 @@ def with_halves(
         [0. 3.]
     """
     image = make(frame, *estimates_of(frame, given))
-    fixed = [e for e in _leaves(given) if isinstance(e, Estimate)]
-    if (
-        needs.missing_for_halves(frame)
-        or any(e.halves is None for e in fixed)
-        or (needs.halves and fixed)
-    ):
+    if not halves_possible(frame, given, needs=needs):
         return Estimate(image)
     halves = [
         make(half, *estimates_of(half, given, number))
         for number, half in enumerate(frame.halves())
     ]
     return Estimate(image, jnp.stack(halves))
+
+
+def halves_possible(frame: Frame, given: Any = (), *, needs: Needs) -> bool:
+    """Return whether a combiner can be run on each half of a frame alone.
+
+    Args:
+        frame: the frame.
+        given: estimates of it, makers, or a tree of both.
+        needs: what the combiner needs of a frame; with `needs.halves` an estimate is
+            not enough, because its halves have no halves of their own.
+
+    Returns:
+        whether; `needs.missing_for_halves` is the reason if the frame is in the way.
+
+    Example:
+        >>> frame = make_frame(jnp.ones((2, 2, 2, 1)))
+        >>> print(halves_possible(frame, needs=Needs(halves=True)))
+        False
+    """
+    fixed = [e for e in _leaves(given) if isinstance(e, Estimate)]
+    passed_on = all(e.halves is not None for e in fixed)
+    return passed_on and not (
+        needs.missing_for_halves(frame) or (needs.halves and fixed)
+    )
 
 
 def estimates_of(part: Frame, given: Any, number: int | None = None) -> Any:

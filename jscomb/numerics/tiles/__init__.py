@@ -15,3 +15,4 @@ from jscomb.numerics.tiles.neighbourhoods import fold_rows as fold_rows
 from jscomb.numerics.tiles.neighbourhoods import map_rows as map_rows
 from jscomb.numerics.tiles.neighbourhoods import sum_over_tiles as sum_over_tiles
 from jscomb.numerics.tiles.programs import compiled as compiled
+from jscomb.numerics.tiles._plans import network_plan as network_plan

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.james_stein.shrinkage import combine
+from jscomb.james_stein._combine import combine
 from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
 from jscomb.numerics.kernels import Kernels, predicted_mean
 from jscomb.numerics.luminance import at_unit_luminance
