@@ -331,10 +331,20 @@ class Needs(NamedTuple):
     extra: str | None = None
     package: str | None = None
 
-    @property
-    def sub_buffers(self) -> int:
-        """Independent sub-buffers that it needs at least."""
-        return 2 if self.halves else 1
+    def package_of(self) -> dict[str, str | None]:
+        """Return the package alone, to add to other needs by `_replace`."""
+        return {"extra": self.extra, "package": self.package}
+
+    def summary(self) -> str:
+        """Return all needs in a few words; empty if there are none."""
+        some = {
+            "variance": self.variance,
+            "half buffers": self.halves,
+            f"{self.channels} channels": self.channels is not None,
+            ", ".join(self.features): bool(self.features),
+            f"extra `{self.extra}`": self.extra is not None,
+        }
+        return ", ".join(name for name, needed in some.items() if needed)
 
     def missing_package(self) -> str:
         """Return which package is missing and how to install it; empty if none."""
@@ -370,7 +380,7 @@ class Needs(NamedTuple):
         """What a frame, or a half of it, with `k` sub-buffers lacks."""
         total = frame.sub_buffers
         unknown = self.variance and frame.buffers.variance is None
-        wanted = self.sub_buffers * (2 if unknown else 1)
+        wanted = (2 if self.halves else 1) * (2 if unknown else 1)
         channels = frame.buffers.color.shape[-1]
         lacking = [f for f in self.features if getattr(frame.buffers, f) is None]
         if self.normalised and frame.unit is None:
