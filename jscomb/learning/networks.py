@@ -24,7 +24,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
-from jscomb.double_shrinkage.neural import Filters
+from jscomb.double_shrinkage import Filters
 from jscomb.james_stein.neural import Parameters
 from jscomb.numerics.convolution import convolve
 from jscomb.numerics.kernels import Kernels
