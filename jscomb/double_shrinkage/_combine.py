@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 from jscomb.numerics.guards import (
     check_not_negative,
     check_same_shape,
-    divide,
-    finite,
     first_finite,
+    weighted_ratio,
+    zero_invalid,
 )
 from jscomb.typing import Image
 
@@ -18,7 +18,7 @@ Errors = Float[Array, "h w _"]
 
 
 class Factors(NamedTuple):
-    """Shares, in [0, 1].
+    """Shares of the images, in [0, 1].
 
     Attributes:
         biased: k1, share of the biased image in the first blend, [H,W,*].
@@ -31,27 +31,26 @@ class Factors(NamedTuple):
     error: Errors
 
     def blend(self, unbiased: Image, biased: Image) -> Image:
-        """x1, of least error without the prior, [H,W,C]."""
+        """Return x1, the blend of both integrators without the prior, [H,W,C]."""
         return self.biased * biased + (1 - self.biased) * unbiased
 
 
 def factors(variance: Errors, mse: Errors, confidence: Errors) -> Factors:
-    """The shares of least expected error.
+    """Return the shares of minimum expected error.
 
-    Pure, and differentiable in every array. An error of zero takes all: first the
-    unbiased image's, then the biased one's, then the prior's.
+    Differentiable. An image whose error is 0 has a share of 1; among several the
+    unbiased one, then the biased one, then the prior.
 
     Args:
-        variance: v of the unbiased image, squared radiance, at least zero, shape
-            [H,W,1] or [H,W,C].
-        mse: m, mean squared error of the biased image, likewise.
-        confidence: eta^2, squared radiance, at least zero, likewise.
+        variance: v of the unbiased image, squared radiance, shape [H,W,1] or [H,W,C].
+        mse: m of the biased image, same.
+        confidence: eta^2, same.
 
     Returns:
         the shares, of the broadcast shape.
 
     Raises:
-        ValueError: if an error is known to be negative.
+        ValueError: if a value is negative; not checked while tracing.
 
     Example:
         >>> one = jnp.ones((1, 1, 1))
@@ -63,11 +62,9 @@ def factors(variance: Errors, mse: Errors, confidence: Errors) -> Factors:
     """
     check_not_negative(variance=variance, mse=mse, confidence=confidence)
     v, m, eta = jnp.broadcast_arrays(variance, mse, confidence)
-    biased = divide(v, v + m, where=v + m > 0)
-    # Not v m / (v + m), whose product leaves float32 for dark images.
-    error = v * divide(m, v + m, where=v + m > 0)
-    prior = divide(error, error + eta, where=error + eta > 0)
-    return Factors(biased, prior, error)
+    # Not v m / (v + m): that product leaves the range of float32 for dark images.
+    error = v * weighted_ratio(m, v + m)
+    return Factors(weighted_ratio(v, v + m), weighted_ratio(error, error + eta), error)
 
 
 def combine(
@@ -78,7 +75,7 @@ def combine(
     mse: Errors,
     confidence: Errors,
 ) -> Image:
-    """Blend two integrators, and the result with a prior, each as its error allows.
+    """Blend two integrators, and the result with a prior, weighted by their errors.
 
     Pure, scale-equivariant, and differentiable in every array.
 
@@ -86,18 +83,17 @@ def combine(
         prior: p, linear radiance, shape [H,W,C].
         unbiased: u, linear radiance, shape [H,W,C].
         biased: b, linear radiance, shape [H,W,C].
-        variance: v of the mean u, squared radiance, at least zero, shape [H,W,1] or
-            [H,W,C].
-        mse: m, mean squared error of b, likewise.
-        confidence: eta^2, squared radiance, likewise; 0 gives the prior, infinity the
-            inverse-error blend of u and b.
+        variance: v of the mean u, squared radiance, shape [H,W,1] or [H,W,C].
+        mse: m, mean squared error of b, same.
+        confidence: eta^2, same; 0 gives the prior, infinity the blend of u and b.
 
     Returns:
         the blend, linear radiance, shape [H,W,C]; at an invalid pixel the first finite
         of (b, u), else 0.
 
     Raises:
-        ValueError: if shapes differ or an error is known to be negative.
+        ValueError: if shapes differ, or an error is negative (not checked while
+            tracing).
 
     Example:
         >>> at = lambda value: jnp.full((1, 1, 1), value)
@@ -116,14 +112,12 @@ def combine(
             raise ValueError(
                 f"{name} must have shape {shapes[0]} or {shapes[1]}: {got}"
             )
-    endless = jnp.isposinf(confidence)  # no prior at all
-    known = jnp.where(endless, 0.0, confidence)
-    valid = finite(prior, unbiased, biased, variance, mse, known)
-    p, u, b, v, m, eta = (
-        jnp.where(valid, image, 0.0)
-        for image in (prior, unbiased, biased, variance, mse, known)
+    no_prior = jnp.isposinf(confidence)
+    known = jnp.where(no_prior, 0.0, confidence)
+    valid, p, u, b, v, m, eta = zero_invalid(
+        prior, unbiased, biased, variance, mse, known
     )
     share = factors(v, m, eta)
-    k2 = jnp.where(endless, 0.0, share.prior)
+    k2 = jnp.where(no_prior, 0.0, share.prior)
     image = k2 * p + (1 - k2) * share.blend(u, b)
     return jnp.where(valid, image, first_finite(biased, unbiased))

@@ -8,7 +8,7 @@ from jscomb.numerics.regression import joint_local_linear
 from jscomb.numerics.weights import gaussian_weights, noise_free_weights
 from jscomb.typing import Image
 
-_EPSILON = 0.01  # eps_1, squared radiance, at an exposure of one
+_EPSILON = 0.01  # eps_1, squared normalised radiance
 _RIDGE = 0.1
 
 
@@ -24,33 +24,28 @@ def radiance_prior(
     epsilon: float = _EPSILON,
     ridge: Float[Array, " f"] | float = _RIDGE,
 ) -> Image:
-    """A smooth image that both integrators and the features agree on.
+    """Fit both integrators by one linear model of the features in each window.
 
-    In each window one linear model of the features is fitted to both images. A pixel's
-    weight for one image is what the other image tells of its likeness, so that it does
-    not depend on the noise it weighs. Pure, and differentiable in every array.
+    The weights for one image come from distances in the other, so that they are
+    independent of the noise that they weight. Pure, and differentiable in every array.
 
     Args:
-        unbiased: u, at an exposure of one, shape [H,W,C].
-        biased: b, likewise.
-        variance: v, of u, mean over channels, at least zero, shape [H,W,1].
-        mse: m, mean squared error of b, mean over channels, at least zero, shape
-            [H,W,1].
-        features: of a range of about one, shape [H,W,F]; F may be 0.
+        unbiased: u, normalised radiance, shape [H,W,C].
+        biased: b, normalised radiance, shape [H,W,C].
+        variance: v of u, mean over channels, at least zero, shape [H,W,1].
+        mse: m of b, mean over channels, at least zero, shape [H,W,1].
+        features: range of about one, shape [H,W,F]; F may be 0.
         window: width of the windows in pixels, odd.
         stride: pixels between the centres of windows.
-        epsilon: > 0, squared radiance; what keeps a window open where there is no
-            noise.
+        epsilon: > 0, squared radiance; bandwidth where there is no noise.
         ridge: > 0, one number or one a feature, shape [F].
 
     Returns:
-        p, shape [H,W,C]. Pixels that are not finite in some input take no part; there,
-        and where no window reaches, it is the mean of u and b if that is finite, else
-        not finite itself.
+        p, shape [H,W,C]. Invalid pixels are excluded; there, and where no window
+        reaches, p is the mean of u and b, which may be not finite.
 
     Raises:
-        ValueError: while tracing, if sizes differ, or a width or number is out of
-            range.
+        ValueError: if shapes differ, or a width or number is out of range.
 
     Example:
         >>> depth, one = jnp.arange(25.0).reshape(5, 5, 1) / 25, jnp.ones((5, 5, 1))
@@ -93,26 +88,25 @@ def blend_prior(
     epsilon: float = _EPSILON,
     ridge: Float[Array, " f"] | float = _RIDGE / 2,
 ) -> Image:
-    """A smooth image of the first blend, where no single integrator is to be a target.
+    """Fit the first blend by a linear model of the features in each window.
 
-    What `radiance_prior` makes of the blend in place of both images, for 0.6 of its
-    time; there the ridge stands beside two sums, hence half of it here.
+    Equals `radiance_prior` with the blend in place of both images, for 0.6 of its time.
+    The ridge is half as large, since one sum stands beside it in place of two.
 
     Args:
-        blend: x1, at an exposure of one, shape [H,W,C].
+        blend: x1, normalised radiance, shape [H,W,C].
         error: s, its squared error, mean over channels, at least zero, shape [H,W,1].
-        features: of a range of about one, shape [H,W,F]; F may be 0.
+        features: range of about one, shape [H,W,F]; F may be 0.
         window: width of the windows in pixels, odd.
         stride: pixels between the centres of windows.
-        epsilon: > 0, squared radiance.
+        epsilon: > 0, squared radiance; bandwidth where there is no noise.
         ridge: > 0, one number or one a feature, shape [F].
 
     Returns:
         p, shape [H,W,C]; the blend where no window reaches.
 
     Raises:
-        ValueError: while tracing, if sizes differ, or a width or the ridge is out of
-            range.
+        ValueError: if shapes differ, or a width or the ridge is out of range.
 
     Example:
         >>> import numpy as np

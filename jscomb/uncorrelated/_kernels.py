@@ -1,7 +1,7 @@
-"""Kernels: weights as a function of what B sub-averages say of a difference.
+"""Kernels: weights as a function of the differences of B sub-averages.
 
-A kernel takes B arrays of one shape, the differences D_ci z^1, ..., D_ci z^B, and gives
-weights in [0, 1] of that shape, element by element.
+A kernel takes B arrays of one shape, the differences D_ci z^1, ..., D_ci z^B, and
+returns weights in [0, 1] of that shape, elementwise.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jscomb.typing import Key, Scalar
-from jscomb.uncorrelated.pairs import Samples, check_samples
+from jscomb.uncorrelated._pairs import Samples, check_samples
 
 Kernel = Callable[..., Array]
 
@@ -20,7 +20,7 @@ _TRIALS = 4096
 
 
 def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
-    """The paper's kernel: less weight where two sub-averages tell of more noise.
+    """Return the paper's kernel: less weight where two sub-averages differ more.
 
     Args:
         gamma: at least zero, per squared radiance.
@@ -50,25 +50,16 @@ def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
 
 
 def rate_of(gamma: Scalar | float, samples: Samples, dtype: jnp.dtype | type) -> Scalar:
-    """Gamma n, what a squared difference is multiplied by.
-
-    Args:
-        gamma: per squared radiance.
-        samples: n, samples a pixel in each sub-average.
-        dtype: of the result.
-
-    Returns:
-        the product, per squared radiance.
-    """
+    """Gamma n, the factor of a squared difference, per squared radiance."""
     return jnp.asarray(gamma, dtype) * jnp.asarray(samples, dtype)
 
 
 class Admissibility(NamedTuple):
-    """What theorem 2 asks of a kernel: both are zero, but for rounding.
+    """What theorem 2 demands of a kernel: both are zero up to rounding.
 
     Attributes:
-        shift: greatest change of a weight when a constant is added to all differences.
-        sign: greatest change of a weight when all differences change sign.
+        shift: maximum change of a weight when a constant is added to all differences.
+        sign: maximum change of a weight when all differences change sign.
     """
 
     shift: Scalar
@@ -78,17 +69,16 @@ class Admissibility(NamedTuple):
 def admissibility(
     key: Key, kernel: Kernel, *, sub_averages: int = 2, scale: float = 1.0
 ) -> Admissibility:
-    """Try a kernel on random differences.
+    """Test a kernel on random differences.
 
     Args:
         key: of the differences and the constants.
         kernel: of `sub_averages` arrays.
         sub_averages: B.
-        scale: the differences' typical size, linear radiance: about where the weights
-            fall.
+        scale: typical size of the differences, linear radiance: where weights fall.
 
     Returns:
-        how much it departs from what makes a combination unbiased.
+        how far the kernel is from what makes a combination unbiased.
 
     Example:
         >>> by_noise = lambda first, second: jnp.exp(-((first - second) ** 2))
@@ -102,7 +92,7 @@ def admissibility(
     Source: IDU eq. 7.
     """
     of_size, of_differences, of_constants = jax.random.split(key, 3)
-    # Over four decades: a kernel may do wrong at any size.
+    # Over four decades: a kernel may fail at any size.
     size = scale * 10 ** jax.random.uniform(of_size, (_TRIALS,), minval=-2, maxval=2)
     shape = (sub_averages, _TRIALS)
     differences = size[None] * jax.random.normal(of_differences, shape)

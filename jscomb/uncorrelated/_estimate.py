@@ -1,47 +1,25 @@
-"""How fast weights should fall: the gamma of least variance, from four pairs."""
+"""Select the gamma of minimum variance, from four pairs of sub-averages."""
 
-import functools
 from collections.abc import Sequence
-from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jscomb.frame import Frame
-from jscomb.numerics.guards import divide
+from jscomb.numerics.guards import weighted_ratio
 from jscomb.numerics.tiles import Grid, Planes, Region, fold_rows, sum_over_tiles
 from jscomb.numerics.windows import check_window, window_mean, window_sum
-from jscomb.typing import Image, Scalar
-from jscomb.uncorrelated.combination import combine
-from jscomb.uncorrelated.kernels import rate_of
-from jscomb.uncorrelated.pairs import (
-    Samples,
-    SubAverages,
-    check_samples,
-    make_pairs,
-    mean,
-)
+from jscomb.typing import Scalar
+from jscomb.uncorrelated._kernels import rate_of
+from jscomb.uncorrelated._pairs import Samples, check_samples, make_pairs
 
-UNIT = 0.005  # of gamma; the paper's candidates are whole multiples of it
+UNIT = 0.005
+"""Unit of gamma, per squared normalised radiance."""
+
 MULTIPLES = 2, 5, 10, 20, 40, 100, 200, 300, 400, 500
+"""The paper's candidates of gamma, in units."""
+
 _TILE, _TILES = 64, 1
-
-
-class Combined(NamedTuple):
-    """What `combine_frames` made.
-
-    Attributes:
-        image: the combination, linear radiance, [H,W,C].
-        gamma: that was chosen, per squared radiance.
-        variances: estimated relative variance for each candidate, see
-            `relative_variances`.
-    """
-
-    image: Image
-    gamma: Scalar
-    variances: Float[Array, " candidates"]
 
 
 def select_gamma(
@@ -56,9 +34,9 @@ def select_gamma(
     stride: int = 4,
     crosswise: bool = False,
 ) -> Scalar:
-    """The candidate whose result has the least estimated relative variance.
+    """Return the gamma whose result has the minimum estimated relative variance.
 
-    Candidates and epsilon are for frames of exposure one: see `combine_frames`.
+    The defaults are for normalised radiance; `select_gamma_frame` is for frames.
 
     Args:
         independent: y^1, ..., y^4, linear radiance, shape [4,H,W,C].
@@ -66,9 +44,9 @@ def select_gamma(
         samples: n, samples a pixel in each sub-average, at least 1.
         window: width of the windows in pixels, odd.
         unit: of gamma, per squared radiance.
-        multiples: the candidates are these times the unit; whole, positive.
-        epsilon: > 0, squared radiance, what keeps the dark from deciding.
-        stride: only every so many rows are judged.
+        multiples: candidates in units; whole, positive.
+        epsilon: > 0, squared radiance; limits the weight of dark pixels.
+        stride: every so many rows are judged.
         crosswise: for `combine_crosswise`.
 
     Returns:
@@ -99,11 +77,6 @@ def select_gamma(
         stride=stride,
         crosswise=crosswise,
     )
-    return _best(variances, unit, multiples)
-
-
-def _best(variances: Array, unit: Scalar | float, multiples: Sequence[int]) -> Scalar:
-    """Gamma of the least variance."""
     best = jnp.asarray(multiples, variances.dtype)[jnp.argmin(variances)]
     return best * jnp.asarray(unit, best.dtype)
 
@@ -120,11 +93,11 @@ def relative_variances(
     stride: int = 4,
     crosswise: bool = False,
 ) -> Float[Array, " candidates"]:
-    """Twice the relative variance of a combination of two pairs, for each candidate.
+    """Estimate twice the relative variance of a combination of two pairs, per gamma.
 
-    The results u^a of pairs {1, 3} and u^b of pairs {2, 4} differ by noise alone: the
-    mean of (u^a - u^b)^2 / (m^2 + epsilon), m the window mean of y. All candidates
-    share one exponential, as powers of it.
+    The results u^a of pairs {1, 3} and u^b of pairs {2, 4} differ by noise alone, so
+    the estimate is the mean of (u^a - u^b)^2 / (m^2 + epsilon), with m the window mean
+    of y. All candidates are powers of one exponential.
 
     Args:
         independent: y^1, ..., y^4, linear radiance, shape [4,H,W,C].
@@ -132,14 +105,15 @@ def relative_variances(
         samples: n, samples a pixel in each sub-average, at least 1.
         window: width of the windows in pixels, odd.
         unit: of gamma, per squared radiance.
-        multiples: the candidates are these times the unit; whole, positive.
-        epsilon: > 0, squared radiance.
-        stride: only every so many rows are judged. Errors of a combination are alike
-            over a window, so a few rows of it know nearly as much as all.
-        crosswise: the kernel of a is applied to b and the other way round.
+        multiples: candidates in units; whole, positive.
+        epsilon: > 0, squared radiance; limits the weight of dark pixels.
+        stride: every so many rows are judged. Errors of a combination are similar over
+            a window, so a few rows suffice.
+        crosswise: the kernel of a is applied to b and vice versa.
 
     Returns:
-        the means over valid pixels and channels, shape [candidates]; 0 if none is.
+        the means over valid pixels and channels, shape [candidates]; 0 if there are
+        none.
 
     Raises:
         ValueError: if shapes differ, there are not four sub-averages, `samples` or
@@ -170,8 +144,8 @@ def relative_variances(
     level = jnp.square(window_mean(pairs.mean, window, mask=pairs.valid))
     weight = valid / (level + jnp.asarray(epsilon, rate.dtype))
     others = window_sum(valid, window) - 1
-    share = divide(valid, others, where=others > 0)
-    # Both halves' channels side by side, so that one sum gives their difference.
+    share = weighted_ratio(valid, others)
+    # The channels of a and b side by side, so that one sum gives their difference.
     excess = jnp.concatenate([a.excess, -b.excess], -1)
     near = [excess, jnp.concatenate(guides, -1), valid]
     here = [a.mean - b.mean, share, weight]
@@ -189,9 +163,9 @@ def _squares(
     window: int,
     stride: int,
 ) -> Planes:
-    """Per pixel, weight (u^a - u^b)^2 summed over channels, for each multiple.
+    """Weight times (u^a - u^b)^2, summed over channels, for each multiple.
 
-    Of images that are seen all over the windows, and others at their centres.
+    `near` are images that are read all over the windows, `here` at their centres.
     """
     reach = check_window(window) // 2
     size = max(here[0].shape[:2])
@@ -201,11 +175,11 @@ def _squares(
     def squares(
         excess: Planes, guide: Planes, valid: Planes, *at_centre: Planes
     ) -> Planes:
-        """Of one tile."""
+        """The squares of one tile."""
         s_c, g_c = excess[:, rows, columns], guide[:, rows, columns]
 
         def exponentials(near: list[Planes]) -> list[Planes]:
-            """Of a row of the window."""
+            """The exponentials of a row of the window."""
             found = []
             for dx in range(window):
                 g_i, valid_i = (p[:, :tile:stride, dx : dx + tile] for p in near)
@@ -222,8 +196,8 @@ def _squares(
                 totals = [total + power * away for total, power in each]
             return totals, exponentials(near[1:])
 
-        # Left to itself XLA would work the exponentials out again for every sum. So
-        # they travel through the loop, and a row's are made one turn ahead.
+        # XLA would otherwise recompute the exponentials for every sum. So the loop
+        # carries them, and computes those of a row one turn ahead.
         ahead = [jnp.roll(planes, -1, axis=1) for planes in (guide, valid)]
         totals = [jnp.zeros_like(s_c) for _ in multiples]
         start = totals, exponentials([guide, valid])
@@ -248,19 +222,7 @@ def _squares(
 
 
 def powers(base: Array, exponents: Sequence[int]) -> list[Array]:
-    """Whole powers of one array by few products.
-
-    Args:
-        base: any shape.
-        exponents: whole, positive.
-
-    Returns:
-        base to each of them.
-
-    Example:
-        >>> print([int(p) for p in powers(jnp.array(2), (1, 5, 10))])
-        [2, 32, 1024]
-    """
+    """Whole, positive powers of one array by few products."""
     known = {1: base}
 
     def power(exponent: int) -> Array:
@@ -272,74 +234,3 @@ def powers(base: Array, exponents: Sequence[int]) -> list[Array]:
         return known[exponent]
 
     return [power(exponent) for exponent in exponents]
-
-
-def combine_frames(
-    independent: Frame, correlated: Frame, *, window: int = 15
-) -> Combined:
-    """Choose gamma for two frames of one scene, and combine them.
-
-    Args:
-        independent: the frame whose pixels have random numbers of their own, with
-            samples, and sub-buffers in a multiple of four.
-        correlated: the same of common random numbers, as many and as large.
-        window: width of the windows in pixels, odd.
-
-    Returns:
-        the combination of all samples, and what it was chosen by.
-
-    Raises:
-        ValueError: if the frames are not alike, have no samples, or their sub-buffers
-            cannot be put together to four, or `window` is even.
-
-    Example:
-        >>> import numpy as np
-        >>> from jscomb.frame import make_frame
-        >>> rng = np.random.default_rng(0)
-        >>> y = rng.normal(1, 0.2, (4, 8, 8, 1))
-        >>> z = rng.normal(1, 0.2, (4, 1, 1, 1)) + 0 * y  # noise alike everywhere
-        >>> y, z = (make_frame(images, samples=64) for images in (y, z))
-        >>> found = combine_frames(y, z, window=5)
-        >>> print(f"{y.color.std():.3f} {found.image.std():.3f}")
-        0.088 0.020
-
-    Source: IDU section 4.2.
-    """
-    (y, of_y), (z, of_z) = (
-        _quarters(name, frame)
-        for name, frame in (("independent", independent), ("correlated", correlated))
-    )
-    if of_y != of_z:
-        raise ValueError(f"correlated has {of_z} samples, independent has {of_y}")
-    return _combined(y, z, independent.median_luminance, of_y, window=window)
-
-
-def _quarters(name: str, frame: Frame) -> tuple[SubAverages, Scalar]:
-    """Four sub-averages of a frame, and its samples."""
-    if frame.sub_buffers % 4:
-        raise ValueError(
-            f"{name} must have sub-buffers in a multiple of 4, got {frame.sub_buffers}"
-        )
-    if frame.samples is None:
-        raise ValueError(f"{name}: how many samples it has is not known")
-    return frame.merged(4).buffers.color, frame.samples
-
-
-@functools.partial(jax.jit, static_argnames="window")
-def _combined(
-    y: SubAverages, z: SubAverages, exposure: Scalar, samples: Scalar, *, window: int
-) -> Combined:
-    """Gamma by quarters, then the combination of halves."""
-    unit = UNIT / jnp.square(exposure)
-    variances = relative_variances(
-        y,
-        z,
-        samples / 4,
-        window=window,
-        unit=unit,
-        epsilon=0.01 * jnp.square(exposure),
-    )
-    gamma = _best(variances, unit, MULTIPLES)
-    y, z = (jnp.stack([mean(images[:2]), mean(images[2:])]) for images in (y, z))
-    image = combine(y, z, gamma, samples / 2, window=window)
-    return Combined(image, gamma, variances)

@@ -1,4 +1,4 @@
-"""An image out of independent and correlated estimates, by weights that do not bias.
+"""Combine independent and correlated estimates by weights that cause no bias.
 
 Every function here is pure, and differentiable in every array and in gamma.
 """
@@ -6,12 +6,12 @@ Every function here is pure, and differentiable in every array and in gamma.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import divide
+from jscomb.numerics.guards import weighted_ratio
 from jscomb.numerics.tiles import Grid, Planes, Region, fold_rows, sum_over_tiles
 from jscomb.numerics.windows import check_window, window_mean, window_sum
 from jscomb.typing import Image, Scalar
-from jscomb.uncorrelated.kernels import Kernel, variance_kernel
-from jscomb.uncorrelated.pairs import Pairs, Samples, SubAverages, make_pairs, mean
+from jscomb.uncorrelated._kernels import Kernel, variance_kernel
+from jscomb.uncorrelated._pairs import Pairs, Samples, SubAverages, make_pairs, mean
 
 _TILE, _TILES = 64, 2
 
@@ -26,13 +26,12 @@ def combine(
 ) -> Image:
     """Combine independent and correlated estimates of one image.
 
-    Pure, and differentiable in every array and in gamma. Scale-equivariant when gamma
-    is in units of the data: divided by s^2 where radiance is multiplied by s.
+    Scale-equivariant if gamma is divided by s^2 where radiance is multiplied by s.
 
     Args:
         independent: y^1, y^2, sub-averages, linear radiance, shape [2,H,W,C].
         correlated: z^1, z^2, sub-averages, linear radiance, shape [2,H,W,C].
-        gamma: at least zero, per squared radiance; 0 takes all pixels alike.
+        gamma: at least zero, per squared radiance; 0 weights all pixels equally.
         samples: n, samples a pixel in each sub-average, at least 1.
         window: width of the windows in pixels, odd.
 
@@ -65,11 +64,11 @@ def combine_with(
     *,
     window: int = 15,
 ) -> Image:
-    """Combine with any kernel; `admissibility` tells whether it leaves no bias.
+    """Combine with any kernel; `admissibility` tests whether it causes bias.
 
     Args:
-        kernel: of B arrays of one shape, D_ci z^1, ..., D_ci z^B in linear radiance,
-            to weights in [0, 1] of that shape. Elementwise.
+        kernel: from B arrays of one shape, D_ci z^1, ..., D_ci z^B in linear radiance,
+            to weights in [0, 1] of that shape, elementwise.
         independent: y^1, ..., y^B, linear radiance, shape [B,H,W,C].
         correlated: z^1, ..., z^B, linear radiance, shape [B,H,W,C].
         window: width of the windows in pixels, odd.
@@ -98,7 +97,7 @@ def combine_with(
 def combine_uniform(
     independent: SubAverages, correlated: SubAverages, *, window: int = 15
 ) -> Image:
-    """Combine with equal weights: unbiased always, and blind to the noise.
+    """Combine with equal weights: always unbiased, whatever the noise.
 
     Args:
         independent: y^1, ..., y^B, linear radiance, shape [B,H,W,C].
@@ -133,10 +132,10 @@ def combine_crosswise(
     *,
     window: int = 15,
 ) -> Image:
-    """Combine with weights from other samples: unbiased always, for half the good.
+    """Combine with weights from other samples: always unbiased, at half the benefit.
 
-    The kernel of the first two pairs is applied to the other two and the other way
-    round, and the two results are averaged.
+    The kernel of the first two pairs is applied to the other two and vice versa, and
+    the two results are averaged.
 
     Args:
         independent: y^1, ..., y^4, linear radiance, shape [4,H,W,C].
@@ -177,10 +176,10 @@ def combine_decorrelated(
     *,
     window: int = 15,
 ) -> Image:
-    """Combine where each z^j was made from its own y^j, as by L2 reconstruction.
+    """Combine where each z^j was made from y^j, as by L2 reconstruction.
 
-    Of every pair only one is used: y^1, y^2 with z^3, z^4 and the other way round; the
-    two results are averaged.
+    One image of each pair is used: y^1, y^2 with z^3, z^4 and vice versa; the two
+    results are averaged.
 
     Args:
         independent: y^1, ..., y^4, linear radiance, shape [4,H,W,C].
@@ -214,15 +213,14 @@ def combine_decorrelated(
 
 
 def _drawn(pairs: Pairs, kernel: Kernel, guides: SubAverages, window: int) -> Image:
-    """u, the mean y of some pairs drawn to its neighbours; weights made of guides."""
+    """Result of some pairs, with weights from the guides."""
     pull = _pull(pairs, kernel, guides, window)
     others = window_sum(pairs.valid.astype(pull.dtype), window) - 1
-    others = jnp.broadcast_to(others, pull.shape)
-    return pairs.mean + divide(pull, others, where=others > 0)
+    return pairs.mean + weighted_ratio(pull, others)
 
 
 def _pull(pairs: Pairs, kernel: Kernel, guides: SubAverages, window: int) -> Image:
-    """Sum over i of kernel(D_ci guides) (s_c - s_i), where s is z - y."""
+    """Sum over i of kernel(D_ci guides) (s_c - s_i), with s = z - y."""
     reach = check_window(window) // 2
     excess = jnp.moveaxis(pairs.excess, -1, 0)
     valid = jnp.moveaxis(pairs.valid, -1, 0).astype(excess.dtype)
@@ -231,7 +229,7 @@ def _pull(pairs: Pairs, kernel: Kernel, guides: SubAverages, window: int) -> Ima
     centre = slice(reach, reach + tile)
 
     def pull(*near: Planes) -> Planes:
-        """Of one tile."""
+        """The sum for one tile."""
         s_c, _, *g_c = (planes[:, centre, centre] for planes in near)
 
         def add_row(total: Planes, moved: list[Planes]) -> Planes:
