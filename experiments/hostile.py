@@ -17,8 +17,8 @@ import OpenEXR
 
 from experiments import assembled
 from jscomb import exr
-from jscomb.exr import own
-from jscomb.exr.files import Part, read_parts, write_parts
+from jscomb.exr import native
+from jscomb.exr._files import Part, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
 
 SIZE = 24, 20  # height and width in pixels
@@ -267,7 +267,11 @@ def _changed_parts(ours: Case, folder: pathlib.Path) -> Iterator[Case]:
 
 def _ours(attributes: dict[str, Any]) -> dict[str, Any]:
     """The attributes that make a file ours."""
-    return {k: v for k, v in attributes.items() if k in (own.ATTRIBUTE, own.PROVENANCE)}
+    return {
+        k: v
+        for k, v in attributes.items()
+        if k in (native.ATTRIBUTE, native.PROVENANCE)
+    }
 
 
 def _unusual(color: np.ndarray) -> Iterator[Case]:
