@@ -36,7 +36,7 @@ from jscomb.denoisers import (
     rdfc,
     smoothing,
 )
-from jscomb.frame import Estimate, Frame, Maker, Needs, estimates_of
+from jscomb.frame import Estimate, Frame, Maker, Needs, estimates_of, with_halves
 from jscomb.numerics.tiles import Local
 from jscomb.typing import Image, Key
 
@@ -60,37 +60,54 @@ _DENOISER = "oidn"  # for frames without an estimate
 
 
 class Method(NamedTuple):
-    """A denoiser or combiner.
+    """A denoiser or combiner: a `plan`, or a `make` for what has none.
 
     Attributes:
         summary: what it does, in one line.
         needs: what it needs of a frame.
-        takes: what it takes beside the frame: nothing, one estimate, or several by name
-            (each an `Estimate` or a `Maker`).
-        make: of a key, a normalised frame and what it takes, to an `Estimate`.
-        plan: the same as a local function of images, of estimates only; None if it
-            always works on the whole frame.
+        takes: what it takes beside the frame: nothing, one estimate, or several by
+            name.
+        plan: of a key, a normalised frame and its estimates, to a local function of
+            images.
+        make: of a key, a normalised frame and what it takes (each an `Estimate` or a
+            `Maker`), to an `Estimate`.
         denoiser: the denoiser that it runs by itself, where it takes no estimate.
+        pure: decides on no values, for `jit` and `vmap`.
     """
 
     summary: str
     needs: Needs
     takes: Literal["nothing", "one estimate", "estimates"]
-    make: Callable[..., Estimate]
     plan: Callable[..., Local] | None = None
+    make: Callable[..., Estimate] | None = None
     denoiser: str | None = None
+    pure: bool = False
 
-    def image(self, key: Key, frame: Frame, given: Sequence[Any]) -> Image:
-        """Return the image alone, [H,W,C], of a frame and its estimates."""
-        if self.plan is None:
-            return self.make(key, frame, *given).image
-        return self.plan(key, frame, *given).whole()
+    def image(self, key: Key, frame: Frame, *estimates: Any) -> Image:
+        """Return the image alone, [H,W,C]."""
+        if self.plan is not None:
+            return self.plan(key, frame, *estimates).whole()
+        assert self.make is not None
+        return self.make(key, frame, *estimates).image
+
+    def estimate(self, key: Key, frame: Frame, *given: Any) -> Estimate:
+        """Return the image, and that of each half where it can be made."""
+        if self.make is not None:
+            return self.make(key, frame, *given)
+        image = functools.partial(self.image, key)
+        return with_halves(frame, image, *given, needs=self.needs)
 
 
 def _denoiser(summary: str, needs: Needs, denoise: Callable[..., Estimate], **options):
-    """A method that denoises a frame."""
+    """A method that denoises a frame as a whole."""
     make = lambda key, frame: denoise(frame, **options)
-    return Method(summary, needs, "nothing", make)
+    return Method(summary, needs, "nothing", make=make)
+
+
+def _filter(summary: str, room: Any) -> Method:
+    """A method that denoises a frame by a local function."""
+    plan = lambda key, frame: room.plan_frame(frame)
+    return Method(summary, room.NEEDS, "nothing", plan, pure=True)
 
 
 def _network(name: str) -> Any:
@@ -102,14 +119,11 @@ def _network(name: str) -> Any:
 
 def _james_stein(summary: str, **options: Any) -> Method:
     """James-Stein without its network."""
-    return Method(
-        summary,
-        james_stein.NEEDS,
-        "one estimate",
-        lambda key, frame, y: james_stein.combine_frame(frame, y, **options),
-        lambda key, frame, y: james_stein.plan_frame(frame, y, **options),
-    )
+    plan = lambda key, frame, y: james_stein.plan_frame(frame, y, **options)
+    return Method(summary, james_stein.NEEDS, "one estimate", plan, pure=True)
 
+
+_OIDN = oidn.NEEDS.package_of()
 
 METHODS: dict[str, Method] = {
     "oidn": _denoiser(
@@ -123,27 +137,19 @@ METHODS: dict[str, Method] = {
         oidn.denoise_frame,
         features=False,
     ),
-    "bilateral": _denoiser(
-        "joint bilateral filter", bilateral.NEEDS, bilateral.denoise_frame
-    ),
-    "nonlocal-means": _denoiser(
-        "non-local means", nonlocal_means.NEEDS, nonlocal_means.denoise_frame
-    ),
-    "rdfc": _denoiser(
-        "non-local means that features restrict", rdfc.NEEDS, rdfc.denoise_frame
-    ),
     "nfor": _denoiser(
         "first-order regression on the features", nfor.NEEDS, nfor.denoise_frame
     ),
-    "gaussian": _denoiser(
-        "Gaussian blur", smoothing.NEEDS, smoothing.denoise_frame
-    ),
+    "bilateral": _filter("joint bilateral filter", bilateral),
+    "nonlocal-means": _filter("non-local means", nonlocal_means),
+    "rdfc": _filter("non-local means restricted by the features", rdfc),
+    "gaussian": _filter("Gaussian blur", smoothing),
     "denoised": Method(
         "the biased image, unchanged",
         Needs(),
         "one estimate",
-        lambda key, frame, y: estimates_of(frame, y),
         lambda key, frame, y: Local(lambda image: image, y.image, 0),
+        pure=True,
     ),
     "james-stein": _james_stein(
         "James-Stein with one variance a 15x15 window", window=15, whiten=False
@@ -151,33 +157,29 @@ METHODS: dict[str, Method] = {
     "whitened": _james_stein("James-Stein with a robust variance for each pixel"),
     "progressive": Method(
         "mixing with Open Image Denoise by SURE",
-        progressive.NEEDS._replace(**oidn.NEEDS.package_of()),
+        progressive.NEEDS._replace(channels=3, **_OIDN),
         "nothing",
-        lambda key, frame: progressive.combine_frame(key, oidn.denoise_color, frame),
+        make=lambda key, frame: progressive.combine_frame(
+            key, oidn.denoise_color, frame
+        ),
         denoiser="oidn",
     ),
     "double-shrinkage": Method(
         "double shrinkage with errors from half buffers",
         double_shrinkage.NEEDS,
         "one estimate",
-        lambda key, frame, y: double_shrinkage.combine_frame(frame, y),
+        make=lambda key, frame, y: double_shrinkage.combine_frame(frame, y),
     ),
     "njs": Method(
         "James-Stein with a trained network",
         james_stein.NEURAL_NEEDS,
         "one estimate",
-        lambda key, frame, y: james_stein.neural_combine_frame(
-            key, _network("njs"), frame, y
-        ),
         lambda key, frame, y: james_stein.plan_neural(key, _network("njs"), frame, y),
     ),
     "pd": Method(
         "progressive denoising with a trained network, of Open Image Denoise",
-        progressive.NEEDS._replace(channels=3, **oidn.NEEDS.package_of()),
+        progressive.NEEDS._replace(channels=3, **_OIDN),
         "nothing",
-        lambda key, frame: progressive.neural_combine_frame(
-            key, oidn.denoise_color, _network("pd"), frame
-        ),
         lambda key, frame: progressive.plan_neural(
             key, oidn.denoise_color, _network("pd"), frame
         ),
@@ -187,16 +189,13 @@ METHODS: dict[str, Method] = {
         "double shrinkage with a trained network",
         double_shrinkage.NEEDS._replace(channels=3),
         "one estimate",
-        lambda key, frame, y: double_shrinkage.neural_combine_frame(
-            _network("dsc"), frame, y
-        ),
         lambda key, frame, y: double_shrinkage.plan_neural(_network("dsc"), frame, y),
     ),
     "ensemble": Method(
         "weights of minimum error for all the frame's estimates and several denoisers",
         ensemble.NEEDS,
         "estimates",
-        lambda key, frame, bases: ensemble.combine_frame(frame, bases),
+        make=lambda key, frame, bases: ensemble.combine_frame(frame, bases),
     ),
 }
 """By name; the cheaper first among the combiners. Uncorrelated kernels are not here:
@@ -291,10 +290,11 @@ def combine(
         return unchanged
     whole, given = _given(key, whole, method, biased)
     chosen = METHODS[method]
+    whole.require(method, chosen.needs)
     if halves is None:
-        made = chosen.make(key, whole, *given)
+        made = chosen.estimate(key, whole, *given)
     else:
-        image = chosen.image(key, whole, estimates_of(whole, given))
+        image = chosen.image(key, whole, *estimates_of(whole, given))
         made = Estimate(image, halves)
     assert whole.unit is not None
     return made if frame.unit is not None else made.scaled(whole.unit)
@@ -342,7 +342,7 @@ def plan(
     if chosen.plan is not None:
         local = chosen.plan(key, whole, *estimates)
     else:
-        local = Local(lambda image: image, chosen.image(key, whole, estimates), 0)
+        local = Local(lambda image: image, chosen.image(key, whole, *estimates), 0)
     if frame.unit is not None:
         return local
     return local._replace(function=lambda images: whole.unit * local.function(images))
@@ -454,7 +454,7 @@ def _halves(
     for half in frame.halves():
         start = time.perf_counter()
         half, given = _given(key, half, method, name)
-        image = METHODS[method].image(key, half, estimates_of(half, given))
+        image = METHODS[method].image(key, half, *estimates_of(half, given))
         images.append(jax.block_until_ready(image))
         seconds = time.perf_counter() - start  # the second half without compilation
     return jnp.stack(images), seconds
@@ -561,7 +561,7 @@ def _with_input(key: Key, frame: Frame, name: str) -> Frame:
             f"{name} takes a biased image itself: make it first, and add it by "
             f"frame.with_estimate({name!r}, ...)"
         )
-    return frame.with_estimate(name, method.make(key, frame))
+    return frame.with_estimate(name, method.estimate(key, frame))
 
 
 def _can_make(name: str, frame: Frame) -> bool:
@@ -586,7 +586,7 @@ def _maker(key: Key, frame: Frame, name: str) -> Estimate | Maker:
     def make(part: Frame) -> Estimate:
         image, halves = part.estimates[name]
         if halves is None and not method.needs.missing_for_halves(part):
-            of_halves = [method.image(key, half, ()) for half in part.halves()]
+            of_halves = [method.image(key, half) for half in part.halves()]
             halves = jnp.stack(of_halves)
         return Estimate(image, halves)
 
