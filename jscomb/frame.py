@@ -393,8 +393,8 @@ class Needs(NamedTuple):
             )
         if k < wanted:
             return (
-                f"half buffers: render at least {wanted * total // k} sub-buffers (this "
-                f"frame has {total})"
+                f"half buffers: render at least {wanted * total // k} sub-buffers "
+                f"(this frame has {total})"
             )
         if self.channels not in (None, channels):
             return f"{self.channels} channels of colour, not {channels}"

@@ -276,9 +276,10 @@ def combine(
     Example:
         >>> from jscomb.frame import make_frame
         >>> x, y = jnp.full((3, 3, 1), 3.0), jnp.ones((3, 3, 1))
-        >>> frame, key = make_frame(x, variance=y, estimates={"y": y}), jax.random.key(0)
+        >>> frame = make_frame(x, variance=y, estimates={"y": y})
         >>> for method in ("denoised", "james-stein"):
-        ...     print(combine(key, frame, method=method).image[0, 0].round(3))
+        ...     made = combine(jax.random.key(0), frame, method=method)
+        ...     print(made.image[0, 0].round(3))
         [1.]
         [2.611]
     """
@@ -290,7 +291,6 @@ def combine(
         return unchanged
     whole, given = _given(key, whole, method, biased)
     chosen = METHODS[method]
-    whole.require(method, chosen.needs)
     if halves is None:
         made = chosen.estimate(key, whole, *given)
     else:
@@ -338,7 +338,6 @@ def plan(
         return Local(lambda image: image, unchanged.image, 0)
     whole, given = _given(key, frame.normalised(), method, biased)
     chosen, estimates = METHODS[method], estimates_of(whole, given)
-    whole.require(method, chosen.needs)
     if chosen.plan is not None:
         local = chosen.plan(key, whole, *estimates)
     else:
@@ -509,6 +508,7 @@ def _given(
     if method not in METHODS:
         raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
     chosen = METHODS[method]
+    frame.require(method, chosen.needs)
     if chosen.takes == "nothing":
         if biased not in (None, chosen.denoiser):
             raise ValueError(f"{method} takes no biased image, got {biased!r}")
@@ -547,7 +547,9 @@ def _input_name(frame: Frame, biased: str | Sequence[str] | None) -> str:
 def _unknown(name: str, frame: Frame) -> str:
     """The error for a biased image that is neither held nor can be made."""
     held = ", ".join(frame.estimates) or "none"
-    return f"no biased image {name!r}: this frame has {held}, and there is no such method"
+    return (
+        f"no biased image {name!r}: this frame has {held}, and there is no such method"
+    )
 
 
 def _with_input(key: Key, frame: Frame, name: str) -> Frame:

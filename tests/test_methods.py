@@ -15,9 +15,7 @@ from jscomb.numerics.tiles import Local
 
 CHEAP = ["denoised", "whitened"]
 key = lambda: jax.random.key(0)
-needs_oidn = pytest.mark.skipif(
-    not oidn.available(), reason="needs Open Image Denoise"
-)
+needs_oidn = pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 
 
 def error(image, frame):
@@ -85,9 +83,7 @@ def average(key, frame, estimate):
     return Local(lambda i: (i["x"] + i["y"]) / 2, images, 0)
 
 
-def test_ten_lines_are_a_method_everywhere(
-    monkeypatch, jscomb, tmp_path, glass_frame
-):
+def test_ten_lines_are_a_method_everywhere(monkeypatch, jscomb, tmp_path, glass_frame):
     """The command, the sweep, the battery and the pages read the table."""
     method = Method("half of each", Needs(), "one estimate", average, pure=True)
     monkeypatch.setitem(METHODS, "average", method)
@@ -206,7 +202,7 @@ def test_an_ensemble_says_what_it_skips(glass_frame):
     assert names == ()
     assert skipped["y"] == "it has no halves"
     assert skipped["bilateral"].startswith("needs half buffers: render at least 2")
-    with pytest.raises(ValueError, match="ensemble has no bases: .*y it has no halves"):
+    with pytest.raises(ValueError, match=r"ensemble has no bases: .*y it has no halves"):
         combine(key(), one, method="ensemble")
 
 

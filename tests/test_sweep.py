@@ -59,9 +59,7 @@ def test_sweep_measures_once(archive, glass_frame):
         found["path tracing", 4.0]["errors"]["RMSE"]
         == (found["path tracing", 1.0]["errors"]["RMSE"])
     )
-    assert (
-        found["whitened", 4.0]["errors"] != (found["whitened", 1.0]["errors"])
-    )
+    assert found["whitened", 4.0]["errors"] != (found["whitened", 1.0]["errors"])
     seconds = found["whitened", 1.0]["seconds"]
     assert seconds["sampling"] is None
     assert min(seconds["denoising"], seconds["combining"]) > 0

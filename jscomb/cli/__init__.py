@@ -19,7 +19,6 @@ from jscomb import methods
 from jscomb.cli._combining import combine
 from jscomb.cli._showing import compare, demo, info
 
-
 __all__ = ["main"]
 
 

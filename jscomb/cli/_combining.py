@@ -218,7 +218,7 @@ def _evidence(trial: methods.Trial) -> str:
 def _with_biased(
     path: Path, frame: Frame, biased: str | None
 ) -> tuple[Frame, str | None]:
-    """The frame with the biased image that was asked for, and its name; None for any."""
+    """The frame with the biased image, and its name; None for any."""
     if biased is None or biased in frame.estimates or biased in methods.METHODS:
         return frame, biased or _only(frame)
     held = ", ".join(frame.estimates) or "none"

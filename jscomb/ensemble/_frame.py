@@ -63,7 +63,9 @@ def stack_estimates(estimates: Mapping[str, Estimate]) -> Stacked:
     shape = estimates[first].image.shape
     for name, (image, halves) in estimates.items():
         if halves is None:
-            raise ValueError(f"an ensemble needs estimates with halves: {name!r} has none")
+            raise ValueError(
+                f"an ensemble needs estimates with halves: {name!r} has none"
+            )
         if image.shape != shape:
             raise ValueError(
                 f"estimate {name!r} has shape {image.shape}, {first!r} has {shape}"

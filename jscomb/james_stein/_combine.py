@@ -176,9 +176,7 @@ def _whitened_share(
     energy, count = sum_and_count(evidence, counted, window)
     if divergence is None:
         return _positive_part(degrees(count), energy)
-    shared = divide(
-        divergence, v, where=counted & (v * maximum > jnp.abs(divergence))
-    )
+    shared = divide(divergence, v, where=counted & (v * maximum > jnp.abs(divergence)))
     return _positive_part(count - window_sum(shared, window), energy)
 
 

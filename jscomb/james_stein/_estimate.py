@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jscomb.james_stein._combine import degrees, prepare, sum_and_count
 from jscomb.james_stein._regression import (
@@ -22,7 +23,6 @@ from jscomb.numerics.guards import (
     safe_sqrt,
 )
 from jscomb.typing import Image, Key, Scalar, Variance
-from jaxtyping import Array, Float
 
 __all__ = ["COARSE", "guide_noise", "risk", "worth_regressing"]
 

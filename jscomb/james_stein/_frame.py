@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jscomb.features import select, stack
 from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
@@ -148,9 +147,10 @@ def regress(
         >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
         >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
         >>> flat = jnp.full((2, 16, 16, 1), 0.5)
-        >>> frame = make_frame(ramp + noise, depth=ramp).normalised(1.0)
-        >>> estimate = Estimate(flat[0], flat)
-        >>> found = regress(jax.random.key(0), frame, estimate, window=9)
+        >>> flat = {"flat": Estimate(flat[0], flat)}
+        >>> frame = make_frame(ramp + noise, depth=ramp, estimates=flat).normalised()
+        >>> key, estimate = jax.random.key(0), frame.estimates["flat"]
+        >>> found = regress(key, frame, estimate, window=9)
         >>> print(f"{found.change.mean:.1f} {found.ran}")
         -0.2 True
     """

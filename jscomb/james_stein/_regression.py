@@ -217,5 +217,3 @@ def guide_noise(biased_a: Image, biased_b: Image, *, robust: bool = True) -> Sca
     if robust:
         return median(square, valid)
     return masked_mean(square, valid)
-
-

@@ -355,8 +355,3 @@ def _gaussian(window: int, sigma: float) -> np.ndarray:
         raise ValueError(f"sigma must be positive, got {sigma}")
     weights = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
     return weights / weights.sum()
-
-
-def reach_of(*windows: int) -> int:
-    """Return how far windows that are applied one after another see."""
-    return sum(check_window(window) // 2 for window in windows)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
@@ -105,6 +104,7 @@ def bound_mixing(
         ValueError: while tracing, if shapes differ or `window` is even.
 
     Example:
+        >>> import jax
         >>> at = lambda value: jnp.full((3, 3, 1), value)
         >>> for variance in (1.0, 0.025, 0.015):
         ...     alpha = jax.jit(bound_mixing)(at(0.5), at(1.0), at(2.0), at(variance))

@@ -9,8 +9,6 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
-
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.sure import monte_carlo_sure
 from jscomb.numerics.tiles import Local, compiled, network_plan
@@ -48,6 +46,7 @@ def combine_frame(
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
+        >>> import jax
         >>> from jscomb.denoisers import smoothing
         >>> from jscomb.frame import make_frame
         >>> noisy = 1 + 0.3 * jax.random.normal(jax.random.key(0), (2, 32, 32, 1))
@@ -89,6 +88,7 @@ def neural_combine_frame(
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
+        >>> import jax
         >>> from jscomb.denoisers import smoothing
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
@@ -106,9 +106,7 @@ def neural_combine_frame(
     return with_halves(frame, make, needs=NEEDS)
 
 
-def plan_neural(
-    key: Key, denoise: Denoise, network: Network, frame: Frame
-) -> Local:
+def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> Local:
     """Return `neural_combine_frame` as a local function of images, for crops.
 
     Args:
@@ -124,6 +122,7 @@ def plan_neural(
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
+        >>> import jax
         >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
@@ -153,6 +152,7 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
+        >>> import jax
         >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> one = jnp.ones((4, 4, 3))

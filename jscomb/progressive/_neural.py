@@ -36,9 +36,7 @@ def activation(outputs: Outputs) -> Image:
     return jnp.clip((first - second) / jnp.maximum(third, 1e-6), 0.0, 1.0)
 
 
-def direct_activation(
-    outputs: Outputs, *, beyond: float = 0.02
-) -> Image:
+def direct_activation(outputs: Outputs, *, beyond: float = 0.02) -> Image:
     """Return alpha from the first output alone, without the form of eq. 9.
 
     Args:

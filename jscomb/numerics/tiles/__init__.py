@@ -1,5 +1,6 @@
 """Large images in parts: cut, worked on, and put together again."""
 
+from jscomb.numerics.tiles._plans import network_plan as network_plan
 from jscomb.numerics.tiles.crops import Crop as Crop
 from jscomb.numerics.tiles.crops import Local as Local
 from jscomb.numerics.tiles.crops import crops as crops
@@ -15,4 +16,3 @@ from jscomb.numerics.tiles.neighbourhoods import fold_rows as fold_rows
 from jscomb.numerics.tiles.neighbourhoods import map_rows as map_rows
 from jscomb.numerics.tiles.neighbourhoods import sum_over_tiles as sum_over_tiles
 from jscomb.numerics.tiles.programs import compiled as compiled
-from jscomb.numerics.tiles._plans import network_plan as network_plan
