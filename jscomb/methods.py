@@ -85,6 +85,7 @@ class Method(NamedTuple):
 
     def image(self, key: Key, frame: Frame, *estimates: Any) -> Image:
         """Return the image alone, [H,W,C]."""
+        key = jax.random.clone(key)  # the parts of a frame share their probes
         if self.plan is not None:
             return self.plan(key, frame, *estimates).whole()
         assert self.make is not None
@@ -93,7 +94,7 @@ class Method(NamedTuple):
     def estimate(self, key: Key, frame: Frame, *given: Any) -> Estimate:
         """Return the image, and that of each half where it can be made."""
         if self.make is not None:
-            return self.make(key, frame, *given)
+            return self.make(jax.random.clone(key), frame, *given)
         image = functools.partial(self.image, key)
         return with_halves(frame, image, *given, needs=self.needs)
 
@@ -339,7 +340,7 @@ def plan(
     whole, given = _given(key, frame.normalised(), method, biased)
     chosen, estimates = METHODS[method], estimates_of(whole, given)
     if chosen.plan is not None:
-        local = chosen.plan(key, whole, *estimates)
+        local = chosen.plan(jax.random.clone(key), whole, *estimates)
     else:
         local = Local(lambda image: image, chosen.image(key, whole, *estimates), 0)
     if frame.unit is not None:

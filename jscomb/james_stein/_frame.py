@@ -4,6 +4,7 @@ import functools
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -142,7 +143,6 @@ def regress(
             as `cross_regression`.
 
     Example:
-        >>> import jax
         >>> from jscomb.frame import make_frame
         >>> ramp = np.linspace(0, 1, 16)[:, None, None] * np.ones((1, 16, 1))
         >>> noise = np.random.default_rng(0).normal(0, 0.2, (2, 16, 16, 1))
@@ -209,7 +209,6 @@ def neural_combine_frame(
         ValueError: if the frame lacks what is needed.
 
     Example:
-        >>> import jax
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
         >>> x = np.random.default_rng(0).normal(1, 0.2, (8, 8, 3)).astype(np.float32)
@@ -225,7 +224,11 @@ def neural_combine_frame(
     Source: NJS section 4.4; with the whitened rule.
     """
     frame.require("njs", NEURAL_NEEDS)
-    make = lambda part, y: plan_neural(key, network, part, y, stride=stride).whole()
+
+    def make(part: Frame, y: Estimate) -> Image:
+        own = jax.random.clone(key)  # halves share the decision's random image
+        return plan_neural(own, network, part, y, stride=stride).whole()
+
     return with_halves(frame, make, estimate, needs=NEURAL_NEEDS)
 
 
@@ -249,7 +252,6 @@ def plan_neural(
         ValueError: if the frame lacks what is needed.
 
     Example:
-        >>> import jax
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
         >>> one = jnp.ones((8, 8, 3), jnp.float32)
@@ -296,7 +298,6 @@ def neural_inputs(
         ValueError: if the frame lacks what is needed.
 
     Example:
-        >>> import jax
         >>> from jscomb.frame import make_frame
         >>> one = jnp.ones((4, 4, 3))
         >>> frame = make_frame(one, variance=one).normalised()

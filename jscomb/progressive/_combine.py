@@ -1,4 +1,4 @@
-"""The mix of a rendering and its denoised image, and the bound that makes it consistent."""
+"""The mix of a rendering and its denoised image, and the bound for consistency."""
 
 from collections.abc import Callable
 

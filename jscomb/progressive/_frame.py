@@ -9,6 +9,8 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
+
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.sure import monte_carlo_sure
 from jscomb.numerics.tiles import Local, compiled, network_plan
@@ -34,7 +36,7 @@ def combine_frame(
     """Denoise a frame, and mix by SURE without a network, whitened.
 
     Args:
-        key: of SURE's probe.
+        key: of SURE's probe, which the halves share.
         denoise: denoiser of a colour and its frame.
         frame: normalised, with variance.
         bound: lower the mixing where it is not consistent with the noise.
@@ -46,7 +48,6 @@ def combine_frame(
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
-        >>> import jax
         >>> from jscomb.denoisers import smoothing
         >>> from jscomb.frame import make_frame
         >>> noisy = 1 + 0.3 * jax.random.normal(jax.random.key(0), (2, 32, 32, 1))
@@ -60,7 +61,8 @@ def combine_frame(
     """
     frame.require("progressive", NEEDS)
     mix = compiled(_mix, bound=bound)
-    make = lambda part: mix(*neural_inputs(key, denoise, part).values())
+    inputs = lambda part: neural_inputs(jax.random.clone(key), denoise, part)
+    make = lambda part: mix(*inputs(part).values())
     return with_halves(frame, make, needs=NEEDS)
 
 
@@ -88,7 +90,6 @@ def neural_combine_frame(
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
-        >>> import jax
         >>> from jscomb.denoisers import smoothing
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
@@ -102,7 +103,8 @@ def neural_combine_frame(
     Source: PD eq. 11, 19; alpha as one output and no bound.
     """
     frame.require("pd", NEEDS)
-    make = lambda part: plan_neural(key, denoise, network, part).whole()
+    plan = lambda part: plan_neural(jax.random.clone(key), denoise, network, part)
+    make = lambda part: plan(part).whole()
     return with_halves(frame, make, needs=NEEDS)
 
 
@@ -122,7 +124,6 @@ def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> L
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
-        >>> import jax
         >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
@@ -152,7 +153,6 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
-        >>> import jax
         >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> one = jnp.ones((4, 4, 3))
