@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from experiments import sweep
-from experiments.combiners import COMBINERS
+from experiments.combiners import combiners
 from experiments.sweep import Record
 from jscomb.denoisers import smoothing
 from jscomb.frame import Frame, with_halves
@@ -71,9 +71,9 @@ def measure_blurred(config: Config) -> None:
     """
     assert config.biased is not None
     swept = sweep.Config(config.biased, config.results, quick=config.quick)
-    names = tuple(n for n in swept.combiners if COMBINERS[n].traced or n == "njs")
+    names = tuple(n for n in swept.combiners if combiners()[n].traced or n == "njs")
     if config.quick:
-        names = ("path tracing", "oidn", "whitened 7x7")
+        names = ("path tracing", "oidn", "whitened")
     swept = dataclasses.replace(swept, combiners=names)
     sweep.run(
         swept,

@@ -20,12 +20,12 @@ from jaxtyping import Array, Float
 from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape, finite, first_finite
-from jscomb.numerics.tiles import compiled
+from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.numerics.windows import reach_of, window_mean
 from jscomb.typing import Image, Variance
 
-__all__ = ["NEEDS", "denoise", "denoise_frame", "reach"]
+__all__ = ["NEEDS", "denoise", "denoise_frame", "plan_frame", "reach"]
 
 NEEDS = Needs(variance=True)
 
@@ -124,6 +124,26 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Estimate:
         ['0.36', '0.05', '0.06']
     """
     frame.require("bilateral", NEEDS)
+    image = lambda part: plan_frame(part, window=window).whole()
+    return with_halves(frame, image, needs=NEEDS)
+
+
+def plan_frame(frame: Frame, *, window: int = 21) -> Local:
+    """Return `denoise_frame` as a local function of images, for crops.
+
+    Args:
+        frame: as for `denoise_frame`.
+        window: width in pixels, odd.
+
+    Returns:
+        the function, its images and how far it sees.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((2, 4, 4, 1))
+        >>> print(plan_frame(make_frame(one, variance=one)).halo)
+        11
+    """
     run = compiled(denoise, window=window)
-    one = lambda part: run(part.color, part.variance, stack(part))
-    return with_halves(frame, one, needs=NEEDS)
+    images = frame.color, frame.variance, stack(frame)
+    return Local(lambda i: run(*i), images, reach(window=window))

@@ -28,12 +28,12 @@ from jaxtyping import Array, Float
 
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape, divide, finite
-from jscomb.numerics.tiles import compiled
+from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import Pairs, Weights, in_noise, weighted_mean
 from jscomb.numerics.windows import check_window, reach_of
 from jscomb.typing import Image, Scalar
 
-__all__ = ["NEEDS", "denoise", "denoise_frame", "reach", "weights"]
+__all__ = ["NEEDS", "denoise", "denoise_frame", "plan_frame", "reach", "weights"]
 
 NEEDS = Needs(variance=True)
 
@@ -167,9 +167,29 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Estimate:
         ['0.36', '0.06', '0.09']
     """
     frame.require("nonlocal_means", NEEDS)
+    image = lambda part: plan_frame(part, window=window).whole()
+    return with_halves(frame, image, needs=NEEDS)
+
+
+def plan_frame(frame: Frame, *, window: int = 21) -> Local:
+    """Return `denoise_frame` as a local function of images, for crops.
+
+    Args:
+        frame: as for `denoise_frame`.
+        window: width in pixels, odd.
+
+    Returns:
+        the function, its images and how far it sees.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((2, 4, 4, 1))
+        >>> print(plan_frame(make_frame(one, variance=one)).halo)
+        13
+    """
     run = compiled(denoise, window=window)
-    one = lambda part: run(part.color, part.color, part.variance)
-    return with_halves(frame, one, needs=NEEDS)
+    images = frame.color, frame.variance
+    return Local(lambda i: run(i[0], *i), images, reach(window=window))
 
 
 def _similarity(patch: int, strength: Scalar | float, p: Pairs, q: Pairs) -> Array:

@@ -17,11 +17,11 @@ from jscomb.denoisers import nonlocal_means
 from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape
-from jscomb.numerics.tiles import compiled
+from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import feature_weights, least_of, weighted_mean
 from jscomb.typing import Image, Variance
 
-__all__ = ["NEEDS", "denoise", "denoise_frame", "reach"]
+__all__ = ["NEEDS", "denoise", "denoise_frame", "plan_frame", "reach"]
 
 NEEDS = Needs(variance=True)
 
@@ -123,10 +123,27 @@ def denoise_frame(frame: Frame, *, window: int = 21) -> Estimate:
         ['0.36', '0.06', '0.09']
     """
     frame.require("rdfc", NEEDS)
+    image = lambda part: plan_frame(part, window=window).whole()
+    return with_halves(frame, image, needs=NEEDS)
+
+
+def plan_frame(frame: Frame, *, window: int = 21) -> Local:
+    """Return `denoise_frame` as a local function of images, for crops.
+
+    Args:
+        frame: as for `denoise_frame`.
+        window: width in pixels, odd.
+
+    Returns:
+        the function, its images and how far it sees.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((2, 4, 4, 1))
+        >>> print(plan_frame(make_frame(one, variance=one)).halo)
+        13
+    """
     run = compiled(denoise, window=window)
-
-    def one(part: Frame) -> Image:
-        features = stack(part._replace(buffers=part.buffers._replace(visibility=None)))
-        return run(part.color, part.color, part.variance, features)
-
-    return with_halves(frame, one, needs=NEEDS)
+    features = stack(frame._replace(buffers=frame.buffers._replace(visibility=None)))
+    images = frame.color, frame.variance, features
+    return Local(lambda i: run(i[0], *i), images, reach(window=window))

@@ -5,11 +5,11 @@ Layout: images [H,W,C], any unit. Pure, and differentiable in every array.
 
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import finite
-from jscomb.numerics.tiles import compiled
+from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.windows import reach_of, window_mean
 from jscomb.typing import Image
 
-__all__ = ["NEEDS", "box", "denoise_frame", "gaussian", "reach"]
+__all__ = ["NEEDS", "box", "denoise_frame", "gaussian", "plan_frame", "reach"]
 
 NEEDS = Needs()
 
@@ -96,8 +96,29 @@ def denoise_frame(frame: Frame, *, sigma: float = 2.0) -> Estimate:
         ['0.69', '0.10', '0.14']
     """
     frame.require("gaussian", NEEDS)
+    image = lambda part: plan_frame(part, sigma=sigma).whole()
+    return with_halves(frame, image, needs=NEEDS)
+
+
+def plan_frame(frame: Frame, *, sigma: float = 2.0) -> Local:
+    """Return `denoise_frame` as a local function of images, for crops.
+
+    Args:
+        frame: as for `denoise_frame`.
+        sigma: > 0, standard deviation in pixels.
+
+    Returns:
+        the function, its images and how far it sees.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((2, 4, 4, 1))
+        >>> print(plan_frame(make_frame(one, variance=one)).halo)
+        6
+    """
     run = compiled(gaussian, sigma=sigma)
-    return with_halves(frame, lambda part: run(part.color), needs=NEEDS)
+    return Local(run, frame.color, reach(sigma=sigma))
 
 
 def _window(sigma: float) -> int:
