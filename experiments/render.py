@@ -389,7 +389,9 @@ def write(config: Config, frame: Frame) -> Frame:
         the frame that was written.
     """
     if config.denoise and oidn.available():
-        frame = frame.with_estimate("oidn", oidn.denoise_frame(frame))
+        whole = frame.normalised()
+        denoised = oidn.denoise_frame(whole).scaled(whole.unit)
+        frame = frame.with_estimate("oidn", denoised)
     provenance = {
         "renderer": f"Mitsuba {scenes.mitsuba().__version__}",
         "variant": scenes.mitsuba().variant(),
