@@ -4,8 +4,8 @@
 
 Every archive in the folder (see `frames`), at every sample count: relative L2 of
 normalised frames, less the reference's noise, of path tracing, of Open Image Denoise,
-and of each combiner (`auto` combines only where the half buffers say that it helps); then
-the geometric mean over the frames of the ratio to the better of the two inputs.
+and of each combiner (`auto` combines only where the half buffers show that it helps);
+then the geometric mean over the frames of the ratio to the better of the two inputs.
 """
 
 import dataclasses

@@ -117,8 +117,8 @@ def run(config: Config) -> dict[int, dict[str, tuple[float, float]]]:
     found: dict[int, dict[str, tuple[float, float]]] = {}
     for frame in stages(config):
         assert frame.samples is not None
-        frame = frame.normalised()
-        samples, images = int(frame.samples), mixed(frame)
+        samples, frame = int(frame.samples), frame.normalised()
+        images = mixed(frame)
         found[samples] = {n: errors(frame, *pair) for n, pair in images.items()}
         row = (f"{n} {a:.5f} ({b:.5f})" for n, (a, b) in found[samples].items())
         tqdm.write(f"{samples} spp: " + ", ".join(row))
