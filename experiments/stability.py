@@ -100,12 +100,12 @@ Combine = Callable[[Image, Image, Variance], Image]
 
 def _network(name: str, inputs: Callable[..., dict[str, Image]]) -> Combine:
     """A trained network's combiner, of three images."""
-    network, recipe = recipes.shipped(name), recipes.RECIPES[name]
+    network = recipes.shipped(name)
 
     def combine(x: Image, y: Image, v: Variance) -> Image:
         unit = median_luminance(x)
         normalised = recipes.in_unit(inputs(x, y, v), unit)
-        return unit * recipe.combine(network, normalised)
+        return unit * recipes.RECIPES[name].combine(network, normalised)
 
     return combine
 
