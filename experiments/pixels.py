@@ -63,8 +63,8 @@ def changed(image: Image, frame: Frame) -> Changed:
     """Compare an image with the denoised one.
 
     Args:
-        image: radiance at an exposure of one, [H,W,3].
-        frame: with reference and `oidn`, likewise.
+        image: normalised radiance, [H,W,3].
+        frame: normalised, with reference and `oidn`.
 
     Returns:
         the change of every pixel's error, and its parts.
@@ -100,8 +100,7 @@ def run(config: Config) -> dict[tuple[str, str], Changed]:
     """
     found = {}
     for path in config.frames:
-        frame = exr.read_frame(path)
-        frame = frame.scaled(1 / frame.median_luminance)
+        frame = exr.read_frame(path).normalised()
         for name in config.combiners:
             chosen = combiners()[name]
             given = [frame, jnp.float32(1)] if chosen.traced else [frame]

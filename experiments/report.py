@@ -93,7 +93,7 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
     frame = exr.read_frame(path)
     if frame.reference is None or "oidn" not in frame.estimates:
         raise ValueError(f"{path} has no reference or no biased image 'oidn'")
-    frame = frame.scaled(1 / frame.median_luminance)
+    frame = frame.normalised()
     images = {name: _made(frame, name) for name in combiners}
     assert frame.reference is not None
     r, noise = frame.reference

@@ -150,7 +150,7 @@ def _narrow_share(
     """
     valid = finite(*other)
 
-    def products(n: Image, w: Image, x: Image) -> tuple[Image, Image]:
+    def products(n: Image, w: Image, x: Image) -> tuple[Array, Array]:
         step, gap = n - w, jnp.where(valid, x - w, 0.0)
         bright = jnp.mean(jnp.square(n), axis=-1, keepdims=True)
         scale = bright + _MINIMUM * jnp.mean(bright)
