@@ -255,7 +255,8 @@ def plan_neural(
     return Local(
         functools.partial(compiled(combine_inputs), network),
         neural_inputs(frame, estimate, stride=stride),
-        halo=None if reach is None else reach + KERNEL // 2,
+        # The maximum, not the sum: a pixel's kernels come from the network there.
+        halo=None if reach is None else max(reach, KERNEL // 2),
         multiple=getattr(network, "multiple", 1),
     )
 
