@@ -145,7 +145,10 @@ COMBINERS: dict[str, Combiner] = {
     "ensemble of 2": Combiner(_of(_ensemble, bases=_FOUR[:2]), 3),
     "ensemble of 4": Combiner(_of(_ensemble, bases=_FOUR), 3),
     "double shrinkage": Combiner(
-        lambda frame: double_shrinkage.combine_frame(frame, "oidn").image, 3
+        lambda frame: (
+            double_shrinkage.combine_frame(frame, frame.estimates["oidn"]).image
+        ),
+        3,
     ),
     "njs": Combiner(_of(_by, method="njs"), 3),
     "pd": Combiner(_of(_by, method="pd"), 0),
