@@ -69,8 +69,9 @@ def measure_untrained(frame: Frame) -> dict[str, float]:
     star = (regressed["biased_a"] + regressed["biased_b"]) / 2
     images["y*"] = star
     images["james-stein, y*"] = james_stein.combine(x, star, pooled)
-    shrunk = double_shrinkage.combine_frame(frame, "oidn", stride=2)
-    images |= {"double shrinkage": shrunk.image, "its prior": shrunk.prior}
+    shrunk = double_shrinkage.combine_frame(frame, frame.estimates["oidn"])
+    prior = double_shrinkage.make_inputs(frame, frame.estimates["oidn"]).prior
+    images |= {"double shrinkage": shrunk.image, "its prior": prior}
     pd = methods.METHODS["pd"].inputs(jax.random.key(0), frame, "oidn")
     mix = functools.partial(progressive.mixing, whiten=True)
     images["progressive, whitened"] = progressive.combine(**pd, mix=mix)
