@@ -30,7 +30,7 @@ from jscomb.denoisers import (
     rdfc,
     smoothing,
 )
-from jscomb.learning import methods, networks
+from jscomb.learning import networks
 from jscomb.numerics import poisson, regression, simplex, sure
 from jscomb.numerics.guards import finite, first_finite
 from jscomb.numerics.weights import noise_free_weights
@@ -173,8 +173,8 @@ def combiners() -> dict[str, Entry]:
             lambda r: james_stein.neural_combine(
                 njs, r.unbiased, *halves(r)[2:], r.variance, exposure=r.unit
             ),
-            methods._U_NET + 1 + 7 + 14,
-            multiple=methods._BLOCK,
+            njs.reach + 7 + 14,
+            multiple=njs.multiple,
         ),
         "ensemble.combine": Entry(_ensemble, rounding=1e-4),
         "ensemble.combine multi-scale": Entry(
@@ -200,15 +200,15 @@ def combiners() -> dict[str, Entry]:
             lambda r: double_shrinkage.neural_combine(
                 dsc, prior(r), *xyv(r)[:2], r.grey, r.grey / 4, exposure=r.unit
             ),
-            methods._U_NET + 6 + 1,
-            multiple=methods._BLOCK,
+            dsc.reach + 6 + 1,
+            multiple=dsc.multiple,
         ),
         "progressive.combine": Entry(lambda r: progressive.combine(*xyv(r), risk(r))),
         "progressive.neural_combine": Entry(
             lambda r: progressive.neural_combine(
                 pd, *xyv(r), risk(r), bound=False, exposure=r.unit
             ),
-            7,
+            pd.reach,
         ),
         **{
             f"choice.{name}": Entry(lambda r, method=method: method(*xyv(r)), 15)
@@ -264,8 +264,8 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
             lambda r: kernel_predicting.denoise(
                 network, r.unbiased, r.variance, seven(r), exposure=r.unit
             ),
-            methods._U_NET + 1 + 5,
-            multiple=methods._BLOCK,
+            network.reach + 5,
+            multiple=network.multiple,
         ),
         "james_stein.cross_regression": Entry(
             _at_one(

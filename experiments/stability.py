@@ -18,8 +18,9 @@ import tyro
 
 from jscomb import choice, ensemble, progressive
 from jscomb.denoisers import smoothing
-from jscomb.learning import methods
+from jscomb.learning import recipes
 from jscomb.numerics.guards import finite
+from jscomb.numerics.luminance import median_luminance
 from jscomb.typing import Image, Variance
 
 
@@ -98,10 +99,12 @@ Combine = Callable[[Image, Image, Variance], Image]
 
 def _network(name: str, inputs: Callable[..., dict[str, Image]]) -> Combine:
     """A trained network's combiner, of three images."""
-    network = methods.shipped(name)
+    network = recipes.shipped(name)
 
     def combine(x: Image, y: Image, v: Variance) -> Image:
-        return methods.METHODS[name].combine(network, inputs(x, y, v))
+        unit = median_luminance(x)
+        normalised = recipes.in_unit(inputs(x, y, v), unit)
+        return unit * recipes.RECIPES[name].combine(network, normalised)
 
     return combine
 
