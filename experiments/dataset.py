@@ -5,8 +5,8 @@
 Every frame is an EXR file by `experiments.render`: two half buffers with variances
 and features, Open Image Denoise of the frame and of its halves, and a reference. The
 sample counts of a scene are drawn from powers of two between 4 and 256 and its frames
-share one reference; their noise is independent of it and of each other. The same command
-resumes an interrupted run, and with more scenes adds to the existing ones.
+share one reference; their noise is independent of it and of each other. The same
+command resumes an interrupted run, and with more scenes adds to the existing ones.
 
 A reference of 1024 samples is itself noisy, which does not matter to a squared error:
 with a reference r + e, E[e] = 0 and e independent of the inputs, the expected loss is

@@ -2,11 +2,11 @@
 
     python -m experiments.learned FOLDER --runs RUNS --results FILE.json
 
-Every archive in the folder (see `frames`), at every sample count: relative L2, corrected
-for the reference's noise, of both inputs, of the estimators without a network, and of
-the networks: those that come with the package, or each run of `experiments.train` in
-RUNS by the name of its folder. Then the geometric mean over the frames of the ratio to
-the better of the two inputs, and the worst frame.
+Every archive in the folder (see `frames`), at every sample count: relative L2,
+corrected for the reference's noise, of both inputs, of the estimators without a
+network, and of the networks: those that come with the package, or each run of
+`experiments.train` in RUNS by the name of its folder. Then the geometric mean over the
+frames of the ratio to the better of the two inputs, and the worst frame.
 """
 
 import dataclasses

@@ -211,7 +211,7 @@ def _lights(mi, rng, half, kind: str) -> dict:
 
 
 def _lamp(mi, rng, half, name: str, power: float) -> dict:
-    """Return a rectangle below the ceiling or a bulb, perhaps shaded, of equal power."""
+    """Return a rectangle below the ceiling or a bulb, perhaps with a shade."""
     at = mi.ScalarTransform4f()
     x, y, z = (float(h) for h in half)
     width = float(np.exp(rng.uniform(np.log(0.04), np.log(0.5))))

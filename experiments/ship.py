@@ -2,9 +2,8 @@
 
     python -m experiments.ship njs RUNS/njs-light FOLDER --results FILE.json
 
-The card holds the network's training data, schedule and losses, and its errors on the
-frames of FOLDER, of scenes that it was not trained on, as `experiments.learned` measures
-them.
+The card holds the network's training data, schedule and losses, and its errors, as
+`experiments.learned` measures them, on the frames of FOLDER, unseen in training.
 """
 
 import dataclasses

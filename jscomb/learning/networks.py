@@ -1,12 +1,11 @@
 """The papers' networks, as immutable callables of one normalised image.
 
-Layout: images [H,W,C], normalised; `vmap` for a batch. Parameters are float32, drawn from
-a typed key. Size "full" is the paper's, "light" has half the channels and a quarter of
+Layout: images [H,W,C], normalised; `vmap` for a batch. Parameters are float32, from a
+typed key. Size "full" is the paper's, "light" has half the channels and a quarter of
 the work. `window` is the width in pixels, odd, of the kernels that a network predicts.
 
-Every network has a `reach`, the distance in pixels, along rows or columns, of the
-farthest input pixel that an output pixel depends on, and a `multiple`: an image may be
-cut into crops that start at multiples of it.
+Every network has a `reach`, the distance in rows or columns of the farthest input pixel
+that an output pixel depends on; crops have to start at multiples of its `multiple`.
 
 Unlike the papers, radiance enters as log(1 + |.|) with its sign and variance as
 log(1 + ./0.01): beside a firefly of 1e6 a network sees nothing else.

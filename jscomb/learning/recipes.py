@@ -72,10 +72,9 @@ def exchanged(inputs: MakeInputs) -> MakeInputs:
         the function with x and y, and v and s, exchanged.
 
     Example:
-        >>> names = "unbiased", "biased", "variance", "sure"
-        >>> other = exchanged(lambda *_: {name: name for name in names})
-        >>> print(other(None, None, None))
-        {'unbiased': 'biased', 'biased': 'unbiased', 'variance': 'sure', 'sure': 'variance'}
+        >>> images = {"unbiased": 1, "biased": 2, "variance": 3, "sure": 4}
+        >>> print(exchanged(lambda *_: images)(None, None, None))
+        {'unbiased': 2, 'biased': 1, 'variance': 4, 'sure': 3}
     """
 
     def other(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
