@@ -24,7 +24,7 @@ from experiments import (
 from jscomb import exr, metrics
 from jscomb.choice import UNTRAINED
 from jscomb.denoisers import oidn
-from jscomb.learning import methods, networks
+from jscomb.learning import networks, recipes
 
 BOX = """<scene version="3.0.0">
   <integrator type="path"/>
@@ -216,9 +216,9 @@ def test_networks_are_measured_beside_the_rest(folder, glass_frame):
     rows = learned.run(learned.Config(folder, quick=True))
     errors = rows["glass", 64]
     assert {"path tracing", "oidn", "whitened", "njs", "dsc", "pd"} <= errors.keys()
-    image = methods.combine_frame(jax.random.key(0), glass_frame, "oidn", method="dsc")
-    r, noise = (i / glass_frame.median_luminance for i in glass_frame.reference)
-    image = image / glass_frame.median_luminance
+    frame, recipe = glass_frame.normalised(), recipes.RECIPES["dsc"]
+    inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
+    image, (r, noise) = recipe.combine(recipes.shipped("dsc"), inputs), frame.reference
     expected = metrics.rel_l2(image, r, half_difference=noise)
     np.testing.assert_allclose(errors["dsc"], expected, rtol=1e-3)
     table = learned.summary(rows)

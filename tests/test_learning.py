@@ -202,28 +202,27 @@ def test_shipped_networks_help(name, glass_frame):
     assert found < 1.1 * denoised
 
 
-@pytest.mark.parametrize("name", ["njs", "dsc", "pd", "kernels"])
-def test_training_in_another_unit_is_training_on_a_frame_in_that_unit(name):
-    """The image of inputs in a unit is that of a scene of another brightness."""
-    recipe = RECIPES[name]
+# Inputs by name: their channels, and the power of the unit that they are measured in.
+INPUTS = {
+    "njs": {"unbiased": (3, 1), "biased_a": (3, 1), "biased_b": (3, 1)}
+    | {"variance": (3, 2)},
+    "dsc": {"prior": (3, 1), "unbiased": (3, 1), "biased": (3, 1)}
+    | {"variance": (1, 2), "mse": (1, 2)},
+    "pd": {"unbiased": (3, 1), "biased": (3, 1), "variance": (3, 2), "sure": (3, 2)},
+    "kernels": {"noisy": (3, 1), "variance": (3, 2)}
+    | {"albedo": (3, 0), "normal": (3, 0), "depth": (1, 0)},
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_a_unit_undoes_the_brightness_of_a_scene(name):
+    recipe, unit = RECIPES[name], jnp.asarray(3.0)
     network = recipe.network(jax.random.key(0), size="light")
-    shapes = {"variance": 3, "biased": 3, "unbiased": 3} | {
-        "njs": {"biased_a": 3, "biased_b": 3},
-        "dsc": {"prior": 3, "variance": 1, "mse": 1},
-        "pd": {"sure": 3},
-        "kernels": {"noisy": 3, "albedo": 3, "normal": 3, "depth": 1},
-    }[name]
-    if name in ("njs", "kernels"):
-        del shapes["biased"]
-    if name == "kernels":
-        del shapes["unbiased"]
-    inputs = {n: jnp.asarray(RNG.random((9, 10, c))) for n, c in shapes.items()}
-    squares, features = {"variance", "sure", "mse"}, {"albedo", "normal", "depth"}
-    bright = {
-        n: i if n in features else (9 if n in squares else 3) * i
-        for n, i in inputs.items()
-    }
-    found = recipe.combine(network, recipes.in_unit(bright, jnp.asarray(3.0)))
+    inputs, bright = {}, {}
+    for key, (channels, power) in INPUTS[name].items():
+        inputs[key] = jnp.asarray(RNG.random((9, 10, channels)))
+        bright[key] = 3.0**power * inputs[key]
+    found = recipe.combine(network, recipes.in_unit(bright, unit))
     np.testing.assert_allclose(found, recipe.combine(network, inputs), rtol=1e-9)
 
 
