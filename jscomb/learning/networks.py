@@ -1,13 +1,11 @@
 """The papers' networks, as immutable callables of one normalised image.
 
-Layout: images [H,W,C]; `vmap` for a batch. Radiance is normalised, variances and errors
-are squares of it. Parameters are drawn from a typed key, in float32. Sizes: "full" is
-the paper's, "light" has half the channels and a quarter of the work. `window` is the
-width in pixels, odd, of the kernels that a network predicts.
+Layout: images [H,W,C], normalised; `vmap` for a batch. Parameters are float32, from a
+typed key. Size "full" is the paper's, "light" has half the channels and a quarter of
+the work. `window` is the width in pixels, odd, of the kernels that a network predicts.
 
-Every network has a `reach`, the distance in pixels, along rows or columns, of the
-farthest input pixel that an output pixel depends on, and a `multiple`: an image may be
-cut into crops that start at multiples of it.
+Every network has a `reach`, the distance in rows or columns of the farthest input pixel
+that an output pixel depends on; crops have to start at multiples of its `multiple`.
 
 Unlike the papers, radiance enters as log(1 + |.|) with its sign and variance as
 log(1 + ./0.01): beside a firefly of 1e6 a network sees nothing else.
@@ -16,6 +14,7 @@ Sources: those of the combiners; M. Kettunen, E. Harkonen, J. Lehtinen, "Deep
 convolutional reconstruction for gradient-domain rendering", 2019 (signed logarithm).
 """
 
+import itertools
 from collections.abc import Iterable
 from typing import Literal
 
@@ -301,8 +300,7 @@ class MixingNetwork(nnx.Module):
     @property
     def reach(self) -> int:
         """Distance of the farthest pixel that an output pixel depends on."""
-        inner = [convolution for block in self.blocks for convolution in block]
-        return _reach([self.first, *inner, self.last])
+        return _reach([self.first, *itertools.chain(*self.blocks), self.last])
 
     def __call__(
         self, unbiased: Image, biased: Image, variance: Variance, sure: Image
