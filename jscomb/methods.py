@@ -49,6 +49,7 @@ __all__ = [
     "Trial",
     "choose",
     "combine",
+    "input_name",
     "inputs",
     "plan",
     "table",
@@ -354,7 +355,7 @@ def _unchanged(
     """The frame's own estimate, bit by bit, if that is what the method returns."""
     if method != "denoised":
         return None
-    return frame.estimates.get(_input_name(frame, biased))
+    return frame.estimates.get(input_name(frame, biased))
 
 
 def choose(
@@ -402,7 +403,7 @@ def choose(
     if not methods or not set(methods) <= METHODS.keys():
         raise ValueError(f"methods {list(methods)}: there are {', '.join(METHODS)}")
     frame = frame.normalised()
-    name = _input_name(frame, biased)
+    name = input_name(frame, biased)
     frame = _with_input(key, frame, name)
     if frame.sub_buffers < 2 or frame.estimates[name].halves is None:
         known = not METHODS["whitened"].needs.missing(frame)
@@ -521,7 +522,7 @@ def _given(
         for name in names:
             frame = _with_input(key, frame, name)
         return frame, ({name: _maker(key, frame, name) for name in names},)
-    name = _input_name(frame, biased)
+    name = input_name(frame, biased)
     frame = _with_input(key, frame, name)
     return frame, (_maker(key, frame, name),)
 
@@ -531,12 +532,31 @@ def _listed(reasons: Mapping[str, str]) -> str:
     return "; ".join(f"{name} {reason}" for name, reason in reasons.items())
 
 
-def _input_name(frame: Frame, biased: str | Sequence[str] | None) -> str:
-    """The biased image to combine with."""
+def input_name(frame: Frame, biased: str | Sequence[str] | None = None) -> str:
+    """Return the name of the biased image that a method of one estimate takes.
+
+    Args:
+        frame: the frame.
+        biased: as for `combine`.
+
+    Returns:
+        the name.
+
+    Raises:
+        ValueError: if there are several and none is named, or the name is unknown.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> print(input_name(make_frame(jnp.ones((2, 4, 4, 3)))))
+        oidn
+    """
     held = list(frame.estimates)
     if biased is None:
         if len(held) > 1:
-            raise ValueError(f"which biased image? this frame has {', '.join(held)}")
+            raise ValueError(
+                f"which biased image? this frame has {', '.join(held)}: name one by "
+                "biased (--biased)"
+            )
         return held[0] if held else _DENOISER
     if not isinstance(biased, str):
         raise ValueError(f"expected one biased image, got {list(biased)}")

@@ -13,9 +13,7 @@ from jscomb.denoisers import bilateral, oidn, smoothing
 from jscomb.frame import Estimate, make_frame
 
 key = lambda: jax.random.key(0)
-needs_oidn = pytest.mark.skipif(
-    not oidn.available(), reason="needs Open Image Denoise"
-)
+needs_oidn = pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 
 
 @pytest.fixture(scope="module")

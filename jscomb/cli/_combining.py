@@ -133,23 +133,23 @@ def _combine_file(path: Path, out: Path, options: Options) -> None:
     try:
         frame, name = _with_biased(path, loaded, options.biased)
         method, combined = _combined(frame, name, options)
+        made_of = _made_of(frame, name, method)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     provenance = {
         "jscomb": jscomb.__version__,
         "method": method,
         "frame": path.name,
-        "biased": name,
+        "biased": made_of,
         "made from": made_from,
         "input": exr.read_provenance(path) if path.is_file() else {},
     }
     exr.write_image(out, combined, provenance=provenance)
-    made_of = f"{method} of {name}" if name else method
-    print(f"wrote {out}: {tables.size(loaded)}, {made_of}")
+    of = f" of {', '.join(made_of)}" if made_of else ""
+    print(f"wrote {out}: {tables.size(loaded)}, {method}{of}")
     if loaded.reference is not None:
-        images = {"input": loaded.color, method: combined}
-        if name in frame.estimates:
-            images[name] = frame.estimates[name].image
+        held = {name: estimate.image for name, estimate in frame.estimates.items()}
+        images = {"input": loaded.color, **held, method: combined}
         tables.print_table({"relative L2": tables.errors(images, loaded)})
 
 
@@ -162,6 +162,16 @@ def _combined(frame: Frame, name: str | None, options: Options) -> tuple[str, Im
         name = None
     local = methods.plan(key, frame, method=method, biased=name)
     return method, _evaluated(local, options.memory * 2**20)
+
+
+def _made_of(frame: Frame, name: str | None, method: str) -> list[str]:
+    """The names of the estimates that a method combines."""
+    chosen = methods.METHODS[method]
+    if chosen.takes == "estimates":
+        return list(methods.inputs(frame.normalised(), name)[0])
+    if chosen.takes == "nothing":
+        return [chosen.denoiser] if chosen.denoiser else []
+    return [methods.input_name(frame, name)]
 
 
 def _evaluated(local: Local, memory: int) -> Image:
@@ -220,7 +230,7 @@ def _with_biased(
 ) -> tuple[Frame, str | None]:
     """The frame with the biased image, and its name; None for any."""
     if biased is None or biased in frame.estimates or biased in methods.METHODS:
-        return frame, biased or _only(frame)
+        return frame, biased
     held = ", ".join(frame.estimates) or "none"
     if not os.path.exists(biased):
         raise ValueError(
@@ -233,10 +243,3 @@ def _with_biased(
     name = Path(biased).name
     return frame.with_estimate(name, Estimate(image)), name
 
-
-def _only(frame: Frame) -> str | None:
-    """The name of the frame's only estimate."""
-    if len(frame.estimates) > 1:
-        held = ", ".join(frame.estimates)
-        raise ValueError(f"holds several biased images, choose --biased: {held}")
-    return next(iter(frame.estimates), None)
