@@ -59,9 +59,7 @@ def _regressed(frame: Frame, *, stride: int, always: bool = False) -> Image:
     """Whitened, with y* where the halves say that it pays, or always."""
     key = jax.random.key(0)
     found = james_stein.regress(key, frame, "oidn", stride=stride, always=always)
-    return choice.UNTRAINED["whitened"](
-        frame.color, found.estimate.image, frame.variance
-    )
+    return choice.UNTRAINED["whitened"](frame.color, found.estimate.image, frame.variance)
 
 
 def _sure(frame: Frame) -> tuple[Variance, Risk]:

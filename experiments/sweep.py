@@ -122,9 +122,7 @@ def cases(config: Config) -> Iterator[Case]:
             path = pathlib.Path(scene)
             for spp in frames.sample_counts(path):
                 frame = frames.load(path, spp)
-                yield Case(
-                    path.stem, spp, [frame.scaled(1 / frame.median_luminance)], None
-                )
+                yield Case(path.stem, spp, [frame.scaled(1 / frame.median_luminance)], None)
             continue
         # Where Mitsuba and XLA have both compiled code, an exception may end a process.
         files, seconds = apart(_rendered, config, scene)

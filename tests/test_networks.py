@@ -262,11 +262,7 @@ def test_scale_equivariant(neural, scale, glass_frame):
 
 def test_gradients_reach_every_parameter(neural, glass_frame):
     network, _, gradient = neural
-    images = (
-        glass_frame.color,
-        glass_frame.estimates["oidn"].image,
-        glass_frame.variance,
-    )
+    images = glass_frame.color, glass_frame.estimates["oidn"].image, glass_frame.variance
     _, (of_network, *_) = gradient(network, *images)
     for leaf in jax.tree.leaves(of_network):
         assert np.any(np.asarray(leaf) != 0)
