@@ -19,7 +19,7 @@ from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape
 from jscomb.numerics.tiles import compiled
-from jscomb.numerics.weights import feature_weights, least_of, weighted_mean
+from jscomb.numerics.weights import feature_weights, minimum_of, weighted_mean
 from jscomb.typing import Image, Variance
 
 
@@ -74,7 +74,7 @@ def denoise(
     alike = nonlocal_means.weights(guide, variance, patch=patch, strength=strength)
     if features.shape[-1]:
         same = feature_weights(features, strength=strength_features)
-        alike = least_of(alike, same)
+        alike = minimum_of(alike, same)
     return weighted_mean(image, alike, window=window)
 
 
