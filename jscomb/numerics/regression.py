@@ -210,9 +210,11 @@ def joint_local_linear(
         *(region(i, grid.reach + h) for i, h in zip(images, halos, strict=True)),
     ]
     sums = jnp.moveaxis(sum_over_tiles(fit, regions, grid), 0, -1)
-    total, weight = sums[..., :-1], jnp.where(valid, sums[..., -1:], 0.0)
-    normal = weight > float(jnp.finfo(weight.dtype).tiny)
-    return LocalFit(weighted_ratio(total, jnp.where(normal, weight, 0.0)), weight)
+    total, weight = sums[..., :-1], sums[..., -1:]
+    # A subnormal weight has lost digits, and is 0 on some devices.
+    normal = valid & (weight > float(jnp.finfo(weight.dtype).tiny))
+    weight = jnp.where(normal, weight, 0.0)
+    return LocalFit(weighted_ratio(total, weight), weight)
 
 
 def _centred(basis: Planes, grid: Grid) -> tuple[Float[Array, "p n"], Array]:
