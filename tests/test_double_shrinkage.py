@@ -125,7 +125,7 @@ def test_a_bad_pixel_stays_local(which):
 
 def test_bad_input(unchecked):
     p, u, b, v, m, eta = images()
-    with pytest.raises(ValueError, match="mse must be at least zero, its least is -"):
+    with pytest.raises(ValueError, match="mse must be at least zero, its minimum is -"):
         double_shrinkage.combine(p, u, b, v, -m, eta)
     with pytest.raises(ValueError, match=r"mse must have shape .*\(6, 7, 3\): None"):
         double_shrinkage.combine(p, u, b, v, None, eta)

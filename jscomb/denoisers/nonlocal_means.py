@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape, divide, finite
 from jscomb.numerics.tiles import Local, compiled
-from jscomb.numerics.weights import Pairs, Weights, in_noise, weighted_mean
+from jscomb.numerics.weights import Pairs, Weights, normalised_distance, weighted_mean
 from jscomb.numerics.windows import check_window, reach_of
 from jscomb.typing import Image, Scalar
 
@@ -209,7 +209,7 @@ def _distance(p: Pairs, q: Pairs, strength: Scalar | float) -> tuple[Array, Arra
         u_p, u_q, v_p, v_q = p[k], q[k], p[channels + k], q[channels + k]
         difference = jnp.square(u_p - u_q) - (v_p + jnp.minimum(v_p, v_q))
         noise = strength**2 * (v_p + v_q)
-        total += in_noise(difference, noise, most=_FARTHEST)
+        total += normalised_distance(difference, noise, maximum=_FARTHEST)
     return total / channels * known, known
 
 

@@ -18,7 +18,7 @@ from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import check_same_shape
 from jscomb.numerics.tiles import Local, compiled
-from jscomb.numerics.weights import feature_weights, least_of, weighted_mean
+from jscomb.numerics.weights import feature_weights, minimum_of, weighted_mean
 from jscomb.typing import Image, Variance
 
 __all__ = ["NEEDS", "denoise", "denoise_frame", "plan_frame", "reach"]
@@ -74,7 +74,7 @@ def denoise(
     weights = nonlocal_means.weights(guide, variance, patch=patch, strength=strength)
     if features.shape[-1]:
         of_features = feature_weights(features, strength=strength_features)
-        weights = least_of(weights, of_features)
+        weights = minimum_of(weights, of_features)
     return weighted_mean(image, weights, window=window)
 
 

@@ -1,8 +1,8 @@
 """Guards against corrupt input: shapes, invalid pixels, divisions and square roots.
 
-A pixel that is not finite in any input of a combiner is *invalid*: every window
-excludes it, and the output there is the first finite of (biased, unbiased), else 0.
-Images are `[H, W, C]`; a pixel is invalid with all its channels.
+A pixel that is not finite in some input of a combiner is *invalid*, with all its
+channels: every window excludes it, and the output there is the first finite of (biased,
+unbiased), else 0. Layout: images [H,W,C].
 """
 
 from collections.abc import Iterable
@@ -15,12 +15,24 @@ from jaxtyping import Array, Bool, Float
 
 from jscomb.typing import Image, Mask
 
+__all__ = [
+    "check_not_negative",
+    "check_same_shape",
+    "divide",
+    "finite",
+    "first_finite",
+    "masked_mean",
+    "safe_sqrt",
+    "weighted_ratio",
+    "zero_invalid",
+]
+
 
 def check_same_shape(**images: Float[Array, "..."]) -> None:
-    """Raise unless every image is `[H, W, C]` and of the first one's shape.
+    """Raise unless all images have one shape [H,W,C].
 
     Args:
-        images: the arrays by the names that the caller's user knows.
+        images: arrays by the names that the user knows.
 
     Returns:
         nothing.
@@ -47,42 +59,41 @@ def check_same_shape(**images: Float[Array, "..."]) -> None:
 
 
 def check_not_negative(**images: Float[Array, "..."]) -> None:
-    """Raise if a value is negative; while tracing nothing is known, nothing raised.
+    """Raise if a value is negative; never while tracing, when values are unknown.
 
     Args:
-        images: the arrays by the names that the caller's user knows.
+        images: arrays by the names that the user knows.
 
     Returns:
         nothing.
 
     Raises:
-        ValueError: names the array and its least value.
+        ValueError: names the array and its minimum.
 
     Example:
         >>> check_not_negative(variance=jnp.array([1.0, -0.5]))
         Traceback (most recent call last):
             ...
-        ValueError: variance must be at least zero, its least is -0.5
+        ValueError: variance must be at least zero, its minimum is -0.5
     """
     for name, image in images.items():
         if isinstance(image, Tracer):
             continue
-        least = np.nanmin(np.asarray(image), initial=0.0)  # jnp would be traced
-        if least < 0:
-            raise ValueError(f"{name} must be at least zero, its least is {least}")
+        minimum = np.nanmin(np.asarray(image), initial=0.0)  # jnp would be traced
+        if minimum < 0:
+            raise ValueError(f"{name} must be at least zero, its minimum is {minimum}")
 
 
 def finite(*images: Float[Array, "h w _"]) -> Mask:
-    """Pixels that are finite in every channel of every image.
+    """Return which pixels are finite in every channel of every image.
 
     Args:
-        images: any number of images of one size, their channels may differ.
+        images: any number of images of one size; channels may differ.
 
     Returns:
         the mask, shape [H,W,1].
 
     Example:
-        >>> import jax.numpy as jnp
         >>> print(finite(jnp.array([[[1.0, jnp.nan], [1.0, 2.0]]]))[..., 0])
         [[False  True]]
     """
@@ -111,15 +122,15 @@ def zero_invalid(*images: Float[Array, "..."]) -> tuple[Mask, *tuple[Array, ...]
 
 
 def _images(image: Array) -> Iterable[Array]:
-    """The images of a stack, or the image alone."""
+    """Return the images of a stack, or the image alone."""
     return [image] if image.ndim == 3 else image
 
 
 def first_finite(*images: Image) -> Image:
-    """At each pixel the first image that is finite there, else 0.
+    """Return at each pixel the first image that is finite there, else 0.
 
     Args:
-        images: candidates in the order of preference, shape [H,W,C] each.
+        images: in the order of preference, shape [H,W,C].
 
     Returns:
         the image, finite everywhere, shape [H,W,C].
@@ -142,7 +153,7 @@ def divide(
     where: Bool[Array, "*n"],
     otherwise: Float[Array, "*n"] | float = 0.0,
 ) -> Float[Array, "*n"]:
-    """A quotient whose value and derivatives are finite wherever the true ones are.
+    """Return a quotient that is finite wherever the true one is; so its derivatives.
 
     The denominator is made safe before the division, and the derivative is written as
     -(n/d)/d, because -n/d^2 leaves the range of float32 below d = 1e-19.
@@ -150,14 +161,13 @@ def divide(
     Args:
         numerator: n, any shape and unit.
         denominator: d, same shape; not zero where it is used.
-        where: the elements to divide.
-        otherwise: the value of all others; no derivative passes to n or d there.
+        where: elements to divide, same shape.
+        otherwise: value of all others; no derivative passes to n or d there.
 
     Returns:
         n/d or `otherwise`, same shape.
 
     Example:
-        >>> import jax, jax.numpy as jnp
         >>> n, d = jnp.array([1.0, 1.0]), jnp.array([4.0, 0.0])
         >>> print(divide(n, d, where=d > 0))
         [0.25 0.  ]
@@ -168,7 +178,7 @@ def divide(
 
 @jax.custom_jvp
 def _quotient(numerator: Array, denominator: Array) -> Array:
-    """n/d with derivatives of every order that never square d."""
+    """Return n/d; its derivatives of every order never square d."""
     return numerator / denominator
 
 
@@ -176,7 +186,7 @@ def _quotient(numerator: Array, denominator: Array) -> Array:
 def _quotient_jvp(
     primals: tuple[Array, Array], tangents: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """d(n/d) = (dn - (n/d) dd) / d."""
+    """Return d(n/d) = (dn - (n/d) dd) / d."""
     (n, d), (dn, dd) = primals, tangents
     quotient = _quotient(n, d)
     return quotient, _quotient(dn - quotient * dd, d)

@@ -8,18 +8,19 @@ from jaxtyping import Array, Float
 from jscomb.numerics.medians import median
 from jscomb.typing import Image, Scalar
 
+__all__ = ["at_unit_luminance", "median_luminance"]
+
 
 def median_luminance(image: Image) -> Scalar:
-    """Return the median of the positive luminances.
+    """Return the median of the positive luminances, the means over the channels.
 
-    Robust against fireflies and black backgrounds. Luminance is the mean over the
-    channels.
+    Robust against fireflies and black backgrounds.
 
     Args:
         image: linear radiance, shape [H,W,C]; may hold pixels that are not finite.
 
     Returns:
-        the median, linear radiance; 1 for an image that is all black.
+        the median, linear radiance; 1 for a black image.
 
     Example:
         >>> image = jnp.array([0.0, 2.0, 3.0, 1e6]).reshape(2, 2, 1)
@@ -55,7 +56,7 @@ def at_unit_luminance(
         0.75
     """
     unit = median_luminance(images[0])
-    # Twice by the unit: its square may leave the range of float32.
+    # Divided twice: the unit's square may leave the range of float32.
     return unit * function(
         *(i / unit for i in images), *(s / unit / unit for s in squares)
     )

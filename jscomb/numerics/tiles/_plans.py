@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jscomb.numerics.tiles.crops import Local
-from jscomb.numerics.tiles.programs import compiled
+from jscomb.numerics.tiles._crops import Local
+from jscomb.numerics.tiles._programs import compiled
 
 
 def network_plan(

@@ -7,11 +7,10 @@ from typing import Any
 import jax
 
 
-@functools.cache
 def compiled(function: Callable[..., Any], **static: Hashable) -> Callable[..., Any]:
     """Return a function with its static options bound, compiled once a shape.
 
-    Called eagerly, a function that loops over tiles compiles its loops anew each time.
+    Called eagerly, a function that loops over tiles compiles its loops at every call.
 
     Args:
         function: of arrays and options; the same object at every call.
@@ -28,4 +27,10 @@ def compiled(function: Callable[..., Any], **static: Hashable) -> Callable[..., 
         >>> compiled(window_sum, window=3) is compiled(window_sum, window=3)
         True
     """
-    return jax.jit(functools.partial(function, **static))
+    return _compiled(function, *sorted(static.items()))
+
+
+@functools.cache
+def _compiled(function: Callable[..., Any], *static: tuple[str, Hashable]) -> Callable:
+    """Compile; options in one order, so that equal ones share a program."""
+    return jax.jit(functools.partial(function, **dict(static)))

@@ -1,7 +1,4 @@
-"""Kinds of weights: how alike two pixels are.
-
-`denoisers.nonlocal_means` has another kind.
-"""
+"""Kinds of weights: how alike two pixels are."""
 
 import functools
 
@@ -9,23 +6,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import check_same_shape, divide, finite
-from jscomb.numerics.weights.pairs import Pairs, Weights
+from jscomb.numerics.guards import check_same_shape, divide, zero_invalid
+from jscomb.numerics.weights._pairs import Pairs, Weights
 from jscomb.typing import Scalar
 
-# A noisy guide's distance beyond which a weight is 0 in any precision.
-_FARTHEST = 1e4
+# Distance of a noisy guide beyond which a weight is 0 in any precision.
+_MAXIMUM = 1e4
 
 
 def gaussian_weights(
     guide: Float[Array, "h w g"], bandwidth: Float[Array, "h w 1"] | Scalar | float
 ) -> Weights:
-    """Weights exp(-|g_i - g_c|^2 / h).
+    """Return weights exp(-|g_i - g_c|^2 / h).
 
     Args:
         guide: g, shape [H,W,G].
         bandwidth: h > 0, unit of the guide squared: one number, or shape [H,W,1] for
-            the mean of both pixels' values. Elsewhere pixels are invalid.
+            the mean of both pixels' values. Where h is not positive pixels are invalid.
 
     Returns:
         the weights.
@@ -50,9 +47,9 @@ def gaussian_weights(
     if h.ndim and h.shape != (*guide.shape[:2], 1):
         raise ValueError(f"bandwidth has shape {h.shape}, guide has {guide.shape}")
     h = jnp.where(h > 0, h, jnp.nan)
-    if h.ndim == 0:  # divided by once a pixel, not once a weight
-        return Weights(guide / jnp.sqrt(h), _gaussian)
-    return Weights(jnp.concatenate([guide, h], axis=-1), _gaussian_of_both)
+    if h.ndim == 0:  # divide once a pixel, not once a weight
+        return Weights(guide / jnp.sqrt(h), _gaussian_pair)
+    return Weights(jnp.concatenate([guide, h], axis=-1), _gaussian_pair_bandwidth)
 
 
 def noise_free_weights(
@@ -61,10 +58,10 @@ def noise_free_weights(
     *,
     epsilon: float,
 ) -> Weights:
-    """Weights exp(-(|g_i - g_c|^2 - v_i - v_c) / (v_i + v_c + eps)).
+    """Return weights exp(-(|g_i - g_c|^2 - v_i - v_c) / (v_i + v_c + eps)).
 
-    As Gaussian ones, but less what noise alone makes of the distance: in a mean over
-    windows, pixels of more noise are worth up to e times as much.
+    Gaussian weights of a distance minus what noise alone contributes to it: in a mean
+    over windows, noisier pixels count up to e times as much.
 
     Args:
         guide: g, shape [H,W,G].
@@ -88,32 +85,32 @@ def noise_free_weights(
 
     Source: DSC eq. 17.
     """
-    kernel = gaussian_weights(guide, 2 * variance + epsilon)
+    gaussian = gaussian_weights(guide, 2 * variance + epsilon)
 
     def pair(p: Pairs, q: Pairs) -> Array:
-        sum_of_both = _mean_of_both(p[-1], q[-1])
-        return kernel.pair(p, q) * jnp.exp(1 - epsilon / sum_of_both)
+        bandwidth = _mean_of_both(p[-1], q[-1])  # v_i + v_c + eps
+        return gaussian.pair(p, q) * jnp.exp(1 - epsilon / bandwidth)
 
-    return kernel._replace(pair=pair)
+    return gaussian._replace(pair=pair)
 
 
 def feature_weights(
-    features: Float[Array, "h w f"], *, strength: float = 0.6, least: float = 1e-3
+    features: Float[Array, "h w f"], *, strength: float = 0.6, minimum: float = 1e-3
 ) -> Weights:
-    """Weights exp(-max_f (f_i - f_c)^2 / (k^2 max(least, |grad f_c|^2))).
+    """Return weights exp(-max_f (f_i - f_c)^2 / (k^2 max(minimum, |grad f_c|^2))).
 
-    The gradient keeps slopes together, such as depth along a floor, that are no edges.
+    The gradient allows for slopes, such as depth along a floor, that are no edges.
 
     Args:
-        features: f, of a range of about one, shape [H,W,F], F at least 1.
-        strength: k > 0; larger calls more alike.
-        least: > 0, differences whose square is smaller count as none.
+        features: f, with a range of about one, shape [H,W,F], F at least 1.
+        strength: k > 0; a larger one tolerates larger differences.
+        minimum: > 0, lower bound of the squared gradient.
 
     Returns:
         the weights.
 
     Raises:
-        ValueError: if `strength` or `least` is not positive.
+        ValueError: if `strength` or `minimum` is not positive.
 
     Example:
         >>> from jscomb.numerics.weights import weighted_mean
@@ -126,10 +123,11 @@ def feature_weights(
     Source: Rousselle et al. 2013, "Robust denoising using feature and color
     information", eq. 6 to 8, for features without noise.
     """
-    if not (strength > 0 and least > 0):
-        raise ValueError(f"strength = {strength} and least = {least} must be positive")
-    slope = jnp.maximum(sum(_square_slope(features, axis) for axis in (0, 1)), least)
-    return Weights(jnp.concatenate([features, strength**2 * slope], -1), _of_features)
+    if not (strength > 0 and minimum > 0):
+        raise ValueError(f"{strength=} and {minimum=} must be positive")
+    slope = jnp.maximum(sum(_square_slope(features, axis) for axis in (0, 1)), minimum)
+    scale = strength**2 * slope
+    return Weights(jnp.concatenate([features, scale], axis=-1), _feature_pair)
 
 
 def bilateral_weights(
@@ -139,16 +137,16 @@ def bilateral_weights(
     *,
     sigma: float,
 ) -> Weights:
-    """Weights exp(-|p - q|^2 / 2 s^2 - |g_p - g_q|^2 - sum d_pq).
+    """Return weights exp(-|p - q|^2 / 2 s^2 - |g_p - g_q|^2 - sum d_pq).
 
-    with d_pq = (z_p - z_q)^2 / (v_p + v_q) of each noisy channel.
+    Here d_pq = (z_p - z_q)^2 / (v_p + v_q) for each noisy channel, and p, q are places.
 
     Args:
-        guide: g, in units of its standard deviation times the root of 2, shape [H,W,G];
-            G may be 0.
-        noisy: z, a guide with noise, scaled likewise, shape [H,W,Z]; Z may be 0.
-        variance: v of the unscaled z, at least zero, shape [H,W,Z].
-        sigma: s > 0, standard deviation in pixels of the distance's share.
+        guide: g, divided by sqrt(2) times its standard deviation, shape [H,W,G]; G may
+            be 0.
+        noisy: z, a guide with noise, divided as g, shape [H,W,Z]; Z may be 0.
+        variance: v of z before that division, at least zero, shape [H,W,Z].
+        sigma: s > 0, standard deviation of the spatial term in pixels.
 
     Returns:
         the weights.
@@ -174,31 +172,31 @@ def bilateral_weights(
         raise ValueError(f"sigma must be positive, got {sigma}")
     if noisy.shape != variance.shape:
         raise ValueError(f"variance has shape {variance.shape}, noisy {noisy.shape}")
-    # Whole numbers, which float32 holds exactly; scaled, large ones would be rounded.
+    # Integers, which float32 holds exactly; scaled, large ones would be rounded.
     place = jnp.asarray(np.moveaxis(np.indices(guide.shape[:2]), 0, -1), guide.dtype)
     parts = np.cumsum([2, guide.shape[-1], noisy.shape[-1]])
 
     def pair(p: Pairs, q: Pairs) -> Array:
         at_p, g_p, z_p, v_p = jnp.split(p, parts)
         at_q, g_q, z_q, v_q = jnp.split(q, parts)
-        far = _square_distance(at_p, at_q) / (2 * sigma**2)
-        far += _square_distance(g_p, g_q)
-        for one, other, v, w in zip(z_p, z_q, v_p, v_q, strict=True):
-            far += in_noise(jnp.square(one - other), v + w, most=_FARTHEST)
-        return jnp.exp(-far)
+        distance = _square_distance(at_p, at_q) / (2 * sigma**2)
+        distance += _square_distance(g_p, g_q)
+        for z, y, v, w in zip(z_p, z_q, v_p, v_q, strict=True):
+            distance += normalised_distance(jnp.square(z - y), v + w, maximum=_MAXIMUM)
+        return jnp.exp(-distance)
 
     return Weights(jnp.concatenate([place, guide, noisy, variance], axis=-1), pair)
 
 
-def least_of(first: Weights, second: Weights) -> Weights:
-    """The lesser of two weights: pixels must be alike in both ways.
+def minimum_of(first: Weights, second: Weights) -> Weights:
+    """Return the minimum of two weights: pixels must be alike in both ways.
 
     Args:
-        first: some weights.
-        second: others, of an image of the same size.
+        first: weights on an image [H,W,*].
+        second: weights on an image of the same size.
 
     Returns:
-        their minimum.
+        the minimum, with the larger halo.
 
     Raises:
         ValueError: while tracing, if the sizes differ.
@@ -207,15 +205,16 @@ def least_of(first: Weights, second: Weights) -> Weights:
         >>> from jscomb.numerics.weights import weighted_mean
         >>> image = jnp.array([1.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1)
         >>> step = lambda at: gaussian_weights(jnp.where(image > at, 1.0, 0.0), 0.01)
-        >>> print(weighted_mean(image, least_of(step(2), step(4)), window=3)[0, :, 0])
+        >>> print(weighted_mean(image, minimum_of(step(2), step(4)), window=3)[0, :, 0])
         [1. 3. 6. 6.]
     """
     check_same_shape(first=first.image[..., :1], second=second.image[..., :1])
     split, halo = first.image.shape[-1], max(first.halo, second.halo)
 
-    def inner(planes: Pairs, own: int) -> Pairs:
-        """Without what lies farther out than one of them wants."""
-        rows, columns = (slice(halo - own, n - (halo - own)) for n in planes.shape[1:3])
+    def inner(planes: Pairs, needed: int) -> Pairs:
+        """Cut a wider halo down to the one needed."""
+        spare = halo - needed
+        rows, columns = (slice(spare, n - spare) for n in planes.shape[1:3])
         return planes[:, rows, columns]
 
     def pair(p: Pairs, q: Pairs) -> Array:
@@ -227,67 +226,66 @@ def least_of(first: Weights, second: Weights) -> Weights:
     return Weights(image, pair, halo)
 
 
-def in_noise(square: Array, noise: Array, *, most: float) -> Array:
-    """A squared distance in units of its noise.
+def normalised_distance(square: Array, noise: Array, *, maximum: float) -> Array:
+    """Return a squared distance divided by its noise.
 
     Args:
-        square: the squared distance; may be below zero, if less what the noise makes.
-        noise: its variance, at least zero, of the same shape and unit.
-        most: the largest result; what a distance without noise counts as.
+        square: squared distance, any shape; may be negative once the noise's part is
+            subtracted.
+        noise: its variance, at least zero, same shape and unit.
+        maximum: upper bound; also the result of a positive distance without noise.
 
     Returns:
-        their ratio.
+        the ratio, same shape.
 
     Example:
         >>> square, noise = jnp.array([4.0, 4.0, 0.0]), jnp.array([2.0, 0.0, 0.0])
-        >>> print(in_noise(square, noise, most=9.0))
+        >>> print(normalised_distance(square, noise, maximum=9.0))
         [2. 9. 0.]
     """
-    near = (most * noise > square) & (noise > 0)
-    far = jnp.where(square > 0, most, jnp.zeros_like(square))
+    near = (maximum * noise > square) & (noise > 0)
+    far = jnp.where(square > 0, maximum, jnp.zeros_like(square))
     return divide(square, noise, where=near, otherwise=far)
 
 
-def _gaussian(p: Pairs, q: Pairs) -> Array:
-    """exp(-|p - q|^2)."""
+def _gaussian_pair(p: Pairs, q: Pairs) -> Array:
+    """Return exp(-|p - q|^2)."""
     return jnp.exp(-_square_distance(p, q))
 
 
-def _gaussian_of_both(p: Pairs, q: Pairs) -> Array:
-    """The same with the mean of both pixels' bandwidths, the last plane."""
+def _gaussian_pair_bandwidth(p: Pairs, q: Pairs) -> Array:
+    """Return exp(-|p - q|^2 / h), h the mean of both pixels' last planes."""
     square = _square_distance(p[:-1], q[:-1])
     return jnp.exp(-square / _mean_of_both(p[-1], q[-1]))
 
 
 def _mean_of_both(p: Array, q: Array) -> Array:
-    """Mean of each pair's values; positive."""
+    """Average each pair's values; positive, also where they are 0."""
     p, q = (jnp.where(i > 0, i, 1.0) for i in (p, q))
     return (p + q) / 2
 
 
-def _of_features(p: Pairs, q: Pairs) -> Array:
-    """exp(-max (f_p - f_q)^2 / s_p): features, then their s, which is above zero."""
+def _feature_pair(p: Pairs, q: Pairs) -> Array:
+    """Return exp(-max (f_p - f_q)^2 / s_p) of planes f, then s > 0."""
     (f_p, scale), (f_q, _) = jnp.split(p, 2), jnp.split(q, 2)
     scale = jnp.where(scale > 0, scale, 1.0)  # 0 outside the image
     pairs = zip(f_p, f_q, scale, strict=True)
-    far = [jnp.square(one - other) / s for one, other, s in pairs]
-    return jnp.exp(-functools.reduce(jnp.maximum, far))
+    distances = [jnp.square(one - other) / s for one, other, s in pairs]
+    return jnp.exp(-functools.reduce(jnp.maximum, distances))
 
 
 def _square_slope(features: Float[Array, "h w f"], axis: int) -> Float[Array, "h w f"]:
-    """Squared central difference along an axis; without pixels that are not finite."""
+    """Return the squared central difference along an axis, 0 at invalid pixels."""
     size = features.shape[axis]
     at = lambda step: jnp.take(
         features, np.clip(np.arange(size) + step, 0, size - 1), axis=axis
     )
-    after, before = at(1), at(-1)
-    known = finite(after, before)
-    difference = jnp.where(known, after, 0.0) - jnp.where(known, before, 0.0)
-    return jnp.square(difference / 2)
+    _, after, before = zero_invalid(at(1), at(-1))
+    return jnp.square((after - before) / 2)
 
 
 def _square_distance(p: Pairs, q: Pairs) -> Array:
-    """|p - q|^2; not expanded into products, which would cancel.
+    """Return |p - q|^2; not expanded into products, which would cancel.
 
     Plane by plane: a sum over an axis would not be vectorised.
     """

@@ -1,8 +1,4 @@
-"""Weights of pairs of pixels, over all windows.
-
-A mean walks the windows and holds one weight a pixel at a time; a regression wants all
-weights of a tile at once, as a matrix.
-"""
+"""Weights of pairs of pixels, over all windows of an image."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import divide, finite, first_finite
+from jscomb.numerics.guards import first_finite, weighted_ratio, zero_invalid
 from jscomb.numerics.tiles import (
     Grid,
     Planes,
@@ -21,20 +17,20 @@ from jscomb.numerics.tiles import (
 )
 from jscomb.numerics.windows import check_window
 
-_TILE, _TILES = 64, 2
+_TILE, _TILES = 64, 2  # pixels a side, and at once
 
-Pairs = Float[Array, "_ _ _ ..."]  # planes of pixels, one of each pair
+Pairs = Float[Array, "_ _ _ ..."]  # planes of one pixel of each pair
 
 
 class Weights(NamedTuple):
-    """How each window weighs its pixels.
+    """A function of two pixels, and the image that it is evaluated on.
 
     Attributes:
-        image: what the weights are made from, [H,W,K].
-        pair: planes of the windows' centres and of pixels in them, [K,h,w,...], to the
-            pairs' weights [h,w,...], finite and at least zero whatever the planes hold.
-        halo: pixels on every side of [h,w] that a weight depends on and that have none
-            themselves; with 0 the pairs need not be neighbours.
+        image: [H,W,K]; a pixel that is not finite is invalid.
+        pair: from planes of the centres and of pixels in their windows, [K,h,w,...], to
+            weights [h,w,...], finite and at least zero for any finite planes.
+        halo: pixels on every side of [h,w] that weights depend on without having one;
+            with 0 the pairs may lie anywhere.
     """
 
     image: Float[Array, "h w k"]
@@ -45,7 +41,7 @@ class Weights(NamedTuple):
 def weighted_mean(
     image: Float[Array, "h w _"], weights: Weights, *, window: int
 ) -> Float[Array, "h w _"]:
-    """Mean over the window of each pixel. Pure, and differentiable in every array.
+    """Average over the window of each pixel.
 
     Args:
         image: any unit, shape [H,W,C].
@@ -53,8 +49,8 @@ def weighted_mean(
         window: width in pixels, odd.
 
     Returns:
-        the mean, shape [H,W,C]. Pixels that are not finite in image or weights take no
-        part; there the result is the image where it is finite, else 0.
+        the mean, shape [H,W,C]. Pixels that are not finite in image or weights are
+        excluded; there the result is the image where it is finite, else 0.
 
     Raises:
         ValueError: while tracing, if the window is even.
@@ -66,17 +62,17 @@ def weighted_mean(
         >>> print(weighted_mean(image, even, window=3)[0, :, 0])
         [2.  4.  5.5]
     """
-    valid = finite(image, weights.image)
+    valid, clean, guide = zero_invalid(image, weights.image)
     reach, halo = check_window(window) // 2, weights.halo
     tile = min(_TILE, max(image.shape[:2]))
     grid = Grid(tile, 1, reach, _TILES)
     wide = tile + 2 * halo
 
     def region(planes: Float[Array, "h w _"], reach: int) -> Region:
-        return Region(jnp.moveaxis(jnp.where(valid, planes, 0.0), -1, 0), reach)
+        return Region(jnp.moveaxis(planes, -1, 0), reach)
 
-    def mean(near: Planes, seen: Planes) -> Planes:
-        """Sums over the windows of a tile: of the image and of the weights."""
+    def sum_windows(near: Planes, seen: Planes) -> Planes:
+        """Sum over the windows of a tile: the image and the weights."""
         centre = seen[:, reach : reach + wide, reach : reach + wide]
 
         def add_row(total: Planes, moved: list[Planes]) -> Planes:
@@ -89,24 +85,23 @@ def weighted_mean(
         start = jnp.zeros((len(near), tile, tile), near.dtype)
         return fold_rows(add_row, start, [near, seen], window)
 
-    taken = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
-    regions = [region(taken, reach), region(weights.image, reach + halo)]
-    sums = jnp.moveaxis(sum_over_tiles(mean, regions, grid, reach=0), 0, -1)
-    weight = jnp.broadcast_to(sums[..., -1:], image.shape)
-    result = divide(sums[..., :-1], weight, where=weight > 0)
-    return jnp.where(valid, result, first_finite(image))
+    counted = jnp.concatenate([clean, valid.astype(image.dtype)], axis=-1)
+    regions = [region(counted, reach), region(guide, reach + halo)]
+    sums = jnp.moveaxis(sum_over_tiles(sum_windows, regions, grid, reach=0), 0, -1)
+    mean = weighted_ratio(sums[..., :-1], sums[..., -1:])
+    return jnp.where(valid, mean, first_finite(image))
 
 
 def tile_weights(weights: Weights, planes: Planes, grid: Grid) -> Float[Array, "m n"]:
-    """The weights of all pixels of a tile's neighbourhood for each centre.
+    """Return the weights of a tile's neighbourhood for each centre.
 
     Args:
         weights: of pairs.
-        planes: of `weights.image`, the neighbourhood and the halo around it, [K,n,n].
+        planes: `weights.image` in the neighbourhood and the halo around it, [K,n,n].
         grid: of the centres.
 
     Returns:
-        the weights [M,N], of any value outside the windows.
+        the weights [M,N], arbitrary outside the windows.
 
     Example:
         >>> from jscomb.numerics.weights import gaussian_weights
@@ -133,10 +128,10 @@ def tile_weights(weights: Weights, planes: Planes, grid: Grid) -> Float[Array, "
 
 
 def _place(w: Float[Array, "a b t o"]) -> Float[Array, "a b t n"]:
-    """From offsets [.., t, o] to places [.., t, t + o], 0 elsewhere.
+    """Move offsets [..., t, o] to places [..., t, t + o], 0 elsewhere.
 
-    Row t is to be moved t places to the right: in memory that is one place more for
-    each row, which is what a row longer by one does.
+    Row t moves t places to the right: in memory one place more for each row, which is
+    what a row longer by one does.
     """
     *outer, count, offsets = w.shape
     n = count + offsets - 1

@@ -1,12 +1,12 @@
-"""An image as overlapping tiles: cut apart, worked on a few at a time, summed again.
+"""An image as overlapping tiles: cut apart, computed a few at a time, summed again.
 
-For work that couples each pixel with a large window and needs much memory a pixel. A
+For functions that couple each pixel with a large window and need much memory a pixel. A
 tile is a square with some centres in it that share one neighbourhood: the square and
 `reach` pixels around it. Layout: planes [K,H,W], channels first, so that a pixel's
-neighbours in a row lie side by side.
+neighbours in a row are adjacent in memory.
 
 Memory: besides the planes only one batch of tiles and one strip of results exist at a
-time. Reverse mode works each batch out again rather than remember it.
+time. Reverse mode computes each batch again rather than store it.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,18 +23,18 @@ Carry = TypeVar("Carry")
 
 
 class Grid(NamedTuple):
-    """Where the centres lie and how many share a tile.
+    """Places of the centres, and how many share a tile.
 
-    There is one centre in every square block of `stride` pixels a side. Its row in the
-    block changes with the block's column and its column with the block's row: on a
-    regular grid most lines of pixels would have no centre, and a thin edge could lie
-    between them.
+    Every square block of `stride` pixels a side has one centre. Its row in the block
+    changes with the block's column and its column with the block's row: on a regular
+    grid most lines of pixels would have no centre, and a thin edge could lie between
+    them.
 
     Attributes:
         side: blocks along one side of a tile.
         stride: pixels along one side of a block.
         reach: radius in pixels of the windows about the centres.
-        batch: most tiles worked on at once.
+        batch: maximum number of tiles computed at once.
     """
 
     side: int
@@ -49,7 +49,7 @@ class Grid(NamedTuple):
 
     @property
     def places(self) -> np.ndarray:
-        """Row and column in the tile of each of its centres, [2,M]."""
+        """Row and column of each centre in its tile, [2,M]."""
         block = np.arange(self.side)
         shift = block % self.stride
         if self.side < self.stride:
@@ -59,7 +59,7 @@ class Grid(NamedTuple):
 
     @property
     def inside(self) -> np.ndarray:
-        """Which pixels of a neighbourhood lie in each centre's window, [M,N]."""
+        """True at the pixels of a neighbourhood in each centre's window, [M,N]."""
         near = np.arange(self.width(self.reach)) - self.reach
         rows, columns = (
             abs(near - place[:, None]) <= self.reach for place in self.places
@@ -67,22 +67,22 @@ class Grid(NamedTuple):
         return (rows[:, :, None] & columns[:, None, :]).reshape(len(rows), -1)
 
     def width(self, reach: int) -> int:
-        """Width in pixels of a tile and what lies around it."""
+        """Width in pixels of a tile and `reach` pixels to either side."""
         return self.step + 2 * reach
 
     def tiles(self, size: int) -> int:
-        """Tiles along an axis of `size` pixels."""
+        """Number of tiles along an axis of `size` pixels."""
         return -(-size // self.step)
 
     def centres(self, planes: Planes) -> Float[Array, "k m"]:
-        """What a tile's centres have, of any of its regions."""
+        """Values of a region of a tile at the tile's centres."""
         size = planes.shape[1]
         rows, columns = self.places + (size - self.step) // 2
         return flat(planes)[:, rows * size + columns]
 
 
 class Region(NamedTuple):
-    """Planes of which each tile sees its centres and some pixels around them.
+    """Planes of which each tile sees its square and some pixels around it.
 
     Attributes:
         planes: zero outside the image, [K,H,W].
@@ -100,17 +100,17 @@ def sum_over_tiles(
     *,
     reach: int | None = None,
 ) -> Planes:
-    """Sum what a function makes of the neighbourhoods of all tiles.
+    """Sum the results of a function of the neighbourhoods of all tiles.
 
     Args:
-        function: of one tile's regions, [K,n,n] each with n = grid.width(its reach), to
-            planes [C,n,n] with n = grid.width(reach). Mapped over tiles.
+        function: from one tile's regions, [K,n,n] each with n = grid.width(its reach),
+            to planes [C,n,n] with n = grid.width(reach). Batched by `vmap`.
         regions: of one image size.
         grid: of the centres.
-        reach: how far around its tile a result goes; None for that of the windows.
+        reach: pixels around a tile that its result extends to; None for the windows'.
 
     Returns:
-        at each pixel the sum over the tiles that contain it, [C,H,W].
+        at each pixel the sum over the results that contain it, [C,H,W].
 
     Example:
         >>> plane = Region(jnp.ones((1, 4, 4)), 1)
@@ -123,7 +123,7 @@ def sum_over_tiles(
     """
     height, width = regions[0].planes.shape[1:]
     columns = grid.tiles(width)
-    pieces = -(-columns // grid.batch)  # of a strip, of equally many tiles
+    pieces = -(-columns // grid.batch)  # of a strip, each of equally many tiles
     batch = -(-columns // pieces)
     reaches = [around for _, around in regions]
     reach = grid.reach if reach is None else reach
@@ -132,11 +132,11 @@ def sum_over_tiles(
     wide = (batch - 1) * grid.step + size
 
     def piece(strips: list[Planes], number: Array) -> Planes:
-        """The sum over one batch of tiles, [C,n,wide]."""
+        """Sum over one batch of tiles, [C,n,wide]."""
         tiles = []
         for strip, around in zip(strips, reaches, strict=True):
             n = grid.width(around)
-            # As long as `_cut` wants, so that nothing is padded here.
+            # As long as `_cut` needs, so that nothing is padded here.
             length = (batch + -(-n // grid.step)) * grid.step
             start = number * batch * grid.step
             near = lax.dynamic_slice_in_dim(strip, start, length, axis=2)
@@ -144,7 +144,7 @@ def sum_over_tiles(
         return _paste(jax.vmap(function)(*tiles), grid.step, wide, axis=2)
 
     def strip(number: Array) -> Planes:
-        """The sum over one row of tiles, [C,n,long + n - step]."""
+        """Sum over one row of tiles, [C,n,long + n - step]."""
         strips = [
             lax.dynamic_slice_in_dim(
                 planes, number * grid.step, grid.width(around), axis=1
@@ -169,18 +169,18 @@ def fold_rows(
 ) -> Carry:
     """Fold over the rows of the windows of a tile.
 
-    The planes move up a row a turn: to read them at a row not known beforehand would
-    take several times as long. Reverse mode works each row out again.
+    The planes move up a row at every step: to read them at a traced row would take
+    several times as long. Reverse mode computes each row again.
 
     Args:
-        add_row: of what was made so far and the planes, moved so that the window's row
-            of their first row's pixels is that row itself, to what is made with it.
-        start: what `add_row` is first given, arrays.
+        add_row: from the state and the planes, moved up so that the k-th row of each
+            pixel's window lies at the pixel's place in the tile, to the next state.
+        start: first state, a tree of arrays.
         near: a tile's regions.
         window: rows of a window in pixels.
 
     Returns:
-        what the last `add_row` made.
+        the last state.
 
     Example:
         >>> plane = jnp.arange(4.0).reshape(1, 4, 1)
@@ -191,9 +191,9 @@ def fold_rows(
 
     @jax.checkpoint
     def step(carry: tuple[Carry, list[Planes]], _) -> tuple:
-        made, moved = carry
-        made = add_row(made, moved)
-        return (made, [jnp.roll(planes, -1, axis=1) for planes in moved]), None
+        state, moved = carry
+        state = add_row(state, moved)
+        return (state, [jnp.roll(planes, -1, axis=1) for planes in moved]), None
 
     return lax.scan(step, (start, list(near)), None, length=window)[0][0]
 
@@ -204,17 +204,17 @@ def map_rows(
     *,
     rows: int = 16,
 ) -> Float[Array, "h _ _"]:
-    """Put an image together from strips of rows, one at a time.
+    """Compute an image in strips of rows, one at a time.
 
-    For a function that needs much memory a pixel. Reverse mode works each strip out
-    again rather than remember it.
+    For a function that needs much memory a pixel. Reverse mode computes each strip
+    again rather than store it.
 
     Args:
-        function: of strips of all images, [rows + 2 reach, W, C] each, to [rows, W, C];
-            the images' W and C may differ.
-        images: of one height, each with its reach: how many rows around a strip the
-            function sees of it, zero outside the image.
-        rows: of a strip of the result.
+        function: from strips of all images, [rows + 2 reach,W,C] each, to [rows,W,C]; W
+            and C may differ.
+        images: of one height, each with its reach, the rows around a strip that the
+            function sees of it; zero outside the image.
+        rows: rows of a strip of the result.
 
     Returns:
         the strips' results as one image, [H,W,C].
@@ -231,19 +231,19 @@ def map_rows(
 
     def strips(image: Array, reach: int) -> Array:
         size = rows + 2 * reach
-        total = (count + -(-size // rows)) * rows  # as `_cut` wants
+        total = (count + -(-size // rows)) * rows  # as `_cut` needs
         ends = [(reach, total - reach - height), (0, 0), (0, 0)]
         return _cut(jnp.pad(image, ends), rows, size, count, axis=0)
 
     each = [strips(image, reach) for image, reach in images]
     if count == 1:
         return function(*(strip[0] for strip in each))[:height]
-    made = lax.map(jax.checkpoint(lambda strips: function(*strips)), each)
-    return made.reshape(count * rows, *made.shape[2:])[:height]
+    results = lax.map(jax.checkpoint(lambda strips: function(*strips)), each)
+    return results.reshape(count * rows, *results.shape[2:])[:height]
 
 
 def flat(planes: Planes) -> Float[Array, "k n"]:
-    """Planes with their pixels along one axis.
+    """Return planes with their pixels along one axis.
 
     Args:
         planes: shape [K,H,W].
@@ -260,7 +260,7 @@ def flat(planes: Planes) -> Float[Array, "k n"]:
 
 
 def _padded(region: Region, grid: Grid, columns: int) -> Planes:
-    """Planes with zeros around them, for every tile and what `_cut` wants."""
+    """Pad planes with zeros: enough for every tile, and for `_cut`."""
     planes, reach = region
     _, height, width = planes.shape
     n = grid.width(reach)
@@ -273,10 +273,10 @@ def _padded(region: Region, grid: Grid, columns: int) -> Planes:
 
 
 def _cut(planes: Array, step: int, size: int, count: int, axis: int) -> Array:
-    """Pieces of `size` pixels, `step` apart, stacked on a new first axis.
+    """Cut pieces of `size` pixels, `step` apart, and stack them on a new first axis.
 
-    Written as reshapes and one concatenation that ends in the final layout: XLA then
-    makes the copy here, and does not spread its index arithmetic over every use.
+    Reshapes and one concatenation in the final layout: XLA then makes the copy here,
+    and does not repeat its index arithmetic at every use.
     """
     parts = -(-size // step)
     shape = planes.shape
@@ -290,7 +290,7 @@ def _cut(planes: Array, step: int, size: int, count: int, axis: int) -> Array:
 
 
 def _paste(tiles: Array, step: int, length: int, axis: int) -> Array:
-    """The sum of the pieces at their places: the transpose of `_cut`."""
+    """Sum the pieces at their places: the transpose of `_cut`."""
     count, size = tiles.shape[0], tiles.shape[axis + 1]
     whole = (count + -(-size // step)) * step
     shape = (*tiles.shape[1 : axis + 1], whole, *tiles.shape[axis + 2 :])
