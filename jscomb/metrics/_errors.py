@@ -100,9 +100,10 @@ def rel_l2_change(
 
     Returns:
         relative L2 of the candidates minus that of the baselines, relative to the mean
-        radiance of both. The standard error assumes independent pixels and includes the
-        spread of the true change over the frame, so it is rather too large. Pixels that
-        are not finite are excluded; NaN if none remains.
+        radiance of both; unbiased for images made from one half. The standard error
+        assumes independent pixels and includes the spread of the true change over the
+        frame, so it is rather too large. Pixels that are not finite are excluded; NaN
+        if none remains.
 
     Raises:
         ValueError: while tracing, if shapes differ.
