@@ -1,4 +1,4 @@
-"""The exact solver for any error matrix: averaged over a window, channels, seeds."""
+"""The exact solver for any error matrix: averaged over windows, channels, seeds."""
 
 from typing import NamedTuple
 
@@ -8,14 +8,14 @@ from jaxtyping import Array, Float
 
 from jscomb.numerics import cholesky
 from jscomb.numerics.guards import divide
-from jscomb.numerics.simplex.active_set import (
+from jscomb.numerics.simplex._active_set import (
     Flat,
     Free,
     in_chunks,
-    is_sound,
-    least_weight,
+    minimum_weight,
     search,
     shared_by_equals,
+    sums_to_one,
 )
 
 Matrix = Float[Array, "n n *batch"]
@@ -23,15 +23,15 @@ Weights = Float[Array, "n *batch"]
 
 
 def quadratic(matrix: Matrix) -> Weights:
-    """Weights of least w'Mw, at least zero, of sum one; exact.
+    """Minimise w'Mw exactly over weights that are at least zero and sum to one.
 
-    Never worse than the best single base, where the search begins. Bases that cannot be
-    told apart get the same weight.
+    Never worse than the best single base, where the search begins. Bases with equal
+    rows of M get the same weight.
 
     Args:
         matrix: M, any unit, shape [N,N,...]; semidefinite on differences of weights,
-            as estimates from halves are. Where rounding has left nothing of that, the
-            weights are feasible, and may be those of the best base alone.
+            as estimates from halves are. Where rounding destroys that, the weights are
+            feasible, and may be those of the best base alone.
 
     Returns:
         the weights, shape [N,...].
@@ -49,11 +49,11 @@ def quadratic(matrix: Matrix) -> Weights:
     """
     _check(matrix)
     n, *batch = matrix.shape[1:]
-    return in_chunks(_least, matrix.reshape(n, n, -1)).reshape(n, *batch)
+    return in_chunks(_solve, matrix.reshape(n, n, -1)).reshape(n, *batch)
 
 
-def _least(matrix: Float[Array, "n n m"]) -> Flat:
-    """The same of M problems."""
+def _solve(matrix: Float[Array, "n n m"]) -> Flat:
+    """Solve M problems."""
     matrix = _known(matrix)
     objective = _objective(matrix)
     fixed = Objective(*lax.stop_gradient(tuple(objective)))
@@ -67,16 +67,16 @@ def _least(matrix: Float[Array, "n n m"]) -> Flat:
 
     active = jnp.ones(start.shape[1:], bool)
     found, free = search(minimise, start.astype(matrix.dtype), start, active)
-    sound = is_sound(_minimum(fixed, free)[0])
-    w, _ = _minimum(objective, jnp.where(sound[None], free, start))
-    feasible = jnp.all(w >= least_weight(w), axis=0)
+    solved = sums_to_one(_minimum(fixed, free)[0])
+    w, _ = _minimum(objective, jnp.where(solved[None], free, start))
+    feasible = jnp.all(w >= minimum_weight(w), axis=0)
     w = jnp.where(feasible[None], jnp.maximum(w, 0.0), found)
     w = shared_by_equals(w, jnp.all(matrix[:, None] == matrix[None], axis=2))
     return w / jnp.sum(w, axis=0, keepdims=True)
 
 
 def affine(matrix: Matrix) -> Weights:
-    """Weights of least w'Mw, of sum one, of either sign.
+    """Minimise w'Mw over weights of either sign that sum to one.
 
     Args:
         matrix: M, any unit, shape [N,N,...].
@@ -102,18 +102,18 @@ def affine(matrix: Matrix) -> Weights:
 
 
 class Objective(NamedTuple):
-    """w'Kw / 2 + r.w, the same on weights of sum one but for a constant.
+    """w'Kw / 2 + r.w: w'Mw up to a constant, on weights that sum to one.
 
     Attributes:
         matrix: K, positive definite, [N,N,M].
         linear: r, [N,M].
-        least: below no pivot of K, [N,M].
+        minimum_pivot: lower bound of the pivots of K, [N,M].
         tolerance: of a derivative, [N,M].
     """
 
     matrix: Float[Array, "n n m"]
     linear: Flat
-    least: Flat
+    minimum_pivot: Flat
     tolerance: Flat
 
 
@@ -124,34 +124,24 @@ def _check(matrix: Matrix) -> None:
 
 
 def _diagonal(matrix: Matrix) -> Weights:
-    """Of the first two axes, [N,...]."""
+    """The diagonal of the first two axes, [N,...]."""
     return jnp.stack([matrix[i, i] for i in range(len(matrix))])
 
 
 def objective_of(matrix: Matrix) -> Objective:
-    """Errors relative to the best base b: K_ij = M_ij - M_ib - M_bj + M_bb.
-
-    So what all bases have in common, which may be much, drowns nothing, and a bad base
-    does not drown the difference of two good ones. The row and column of b are 0; a
-    number added to all of K makes it definite.
-
-    Args:
-        matrix: M, any unit, shape [N,N,...].
-
-    Returns:
-        the objective of M problems, without unit; where some number is not finite that
-        of equal bases.
-
-    Raises:
-        ValueError: while tracing, if the matrix is not square or N is 0.
-    """
+    """Return the objectives of matrices [N,N,...]; without unit."""
     _check(matrix)
     n = len(matrix)
     return _objective(_known(matrix.reshape(n, n, -1)))
 
 
 def _objective(m: Float[Array, "n n m"]) -> Objective:
-    """The same of finite matrices."""
+    """Errors relative to the best base b: K_ij = M_ij - M_ib - M_bj + M_bb.
+
+    So differences of two good bases survive rounding, however large the error that all
+    bases share and that of a bad base. The row and column of b are 0; a number added to
+    all of K makes it definite.
+    """
     n, diagonal = len(m), _diagonal(m)
     best = jnp.arange(n)[:, None] == jnp.argmin(diagonal, axis=0)[None]
     column = jnp.sum(jnp.where(best[None], m, 0.0), axis=1)  # M_ib
@@ -173,37 +163,28 @@ def _objective(m: Float[Array, "n n m"]) -> Objective:
 
 
 def _known(matrix: Float[Array, "n n m"]) -> Float[Array, "n n m"]:
-    """0 in problems where some number is not finite: all bases are equal there."""
+    """The matrices, 0 (equal bases) in problems with a number that is not finite."""
     known = jnp.all(jnp.isfinite(matrix), axis=(0, 1), keepdims=True)
     return jnp.where(known, matrix, 0.0)
 
 
 def _minimum(objective: Objective, free: Free) -> tuple[Flat, Float[Array, " m"]]:
-    """The free weights of least objective, and its derivative along their sum."""
+    """The free weights of minimum objective, and its derivative along their sum."""
     n, both = len(free), free[:, None] & free[None]
     eye = jnp.eye(n, dtype=bool)[..., None]
     k = jnp.where(both, objective.matrix, jnp.where(eye, 1.0, 0.0))
     ones = jnp.where(free, 1.0, 0.0).astype(k.dtype)
     linear = jnp.where(free, objective.linear, 0.0)
     right = jnp.stack([ones, linear], axis=1)
-    per_level, shift = jnp.moveaxis(cholesky.solve(k, right, objective.least), 1, 0)
+    per_level, shift = jnp.moveaxis(
+        cholesky.solve(k, right, objective.minimum_pivot), 1, 0
+    )
     level = (1 + jnp.sum(shift, axis=0)) / jnp.sum(per_level, axis=0)
     return level[None] * per_level - shift, level
 
 
 def share_along(objective: Objective, w: Flat, base: Array) -> Float[Array, " m"]:
-    """Share of one base in its best blend with an ensemble.
-
-    Args:
-        objective: of M problems.
-        w: weights of the ensemble, shape [N,M].
-        base: its number.
-
-    Returns:
-        the share, in [0, 1], shape [M].
-
-    Source: ED eq. 29, for any matrix.
-    """
+    """Return the share of one base in its best blend with an ensemble (ED eq. 29)."""
     chosen = (jnp.arange(len(w)) == base).astype(w.dtype)[:, None]
     d = chosen - w
     curved = jnp.sum(objective.matrix * d[None], axis=1)

@@ -1,4 +1,4 @@
-"""The paper's solver: one base after the other is blended in, in closed form."""
+"""The paper's solver: blend in one base after the other, in closed form."""
 
 from collections.abc import Callable
 
@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jscomb.numerics.simplex.active_set import Flat
-from jscomb.numerics.simplex.hull import Points, Targets, Weights, plane, share_of
-from jscomb.numerics.simplex.quadratic import Matrix, objective_of, share_along
+from jscomb.numerics.simplex._active_set import Flat
+from jscomb.numerics.simplex._hull import Points, Targets, Weights, plane, share_of
+from jscomb.numerics.simplex._quadratic import Matrix, objective_of, share_along
 from jscomb.typing import Key
 
 
@@ -24,21 +24,21 @@ def iterative(
     tolerance: float = 1e-6,
     patience: int = 3,
 ) -> Weights:
-    """Weights of the least squares of `hull`, by blending in one base at a time.
+    """Solve the least squares of `hull` by blending in one base at a time.
 
-    From random weights; in each cycle every base once, in a random order that all
-    problems share. Many thousands of steps from exact where the optimum mixes three or
-    more bases; not differentiable.
+    Starts at random weights; each cycle takes every base once, in a random order that
+    all problems share. Where the optimum mixes three or more bases, even thousands of
+    steps are not exact. Not differentiable.
 
     Args:
-        key: of the start and of the orders, a typed key.
+        key: a typed key, for the start and the orders.
         points_a: of each base, from half a, any unit, shape [N,...].
-        points_b: from half b, likewise.
+        points_b: from half b, same shape.
         target_a: from half a, same unit, shape [...].
-        target_b: from half b, likewise.
-        steps: blends at most.
-        tolerance: a cycle in which no weight of any problem moves more is quiet.
-        patience: quiet cycles in a row after which to stop.
+        target_b: from half b, same shape.
+        steps: maximum number of blends.
+        tolerance: largest change of a weight in a cycle without progress.
+        patience: cycles in a row without progress after which to stop.
 
     Returns:
         the weights, shape [N,...].
@@ -72,14 +72,14 @@ def iterative_quadratic(
     tolerance: float = 1e-6,
     patience: int = 3,
 ) -> Weights:
-    """Weights of least w'Mw, of `quadratic`, by blending in one base at a time.
+    """Minimise w'Mw of `quadratic` by blending in one base at a time.
 
     Args:
-        key: of the start and of the orders, a typed key.
+        key: a typed key, for the start and the orders.
         matrix: M, any unit, shape [N,N,...].
-        steps: blends at most.
-        tolerance: a cycle in which no weight of any problem moves more is quiet.
-        patience: quiet cycles in a row after which to stop.
+        steps: maximum number of blends.
+        tolerance: largest change of a weight in a cycle without progress.
+        patience: cycles in a row without progress after which to stop.
 
     Returns:
         the weights, shape [N,...].
@@ -111,7 +111,7 @@ def _cycles(
     tolerance: float,
     patience: int,
 ) -> Flat:
-    """Blend until nothing moves; `share` is that of one base in the best blend."""
+    """Blend until nothing moves; `share` returns the share of one base that is best."""
     n, _ = shape
     of_start, of_orders = jax.random.split(key)
     w = jax.random.uniform(of_start, shape, dtype)

@@ -1,4 +1,4 @@
-"""The exact solver in the plane: two halves, so every base is a point."""
+"""The exact solver in the plane, where every base is a point of two halves."""
 
 import itertools
 
@@ -7,8 +7,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jscomb.numerics import cholesky
-from jscomb.numerics.guards import divide
-from jscomb.numerics.simplex.active_set import Flat, in_chunks, search, shared_by_equals
+from jscomb.numerics.guards import divide, safe_sqrt
+from jscomb.numerics.simplex._active_set import (
+    Flat,
+    in_chunks,
+    search,
+    shared_by_equals,
+)
 
 Points = Float[Array, "n *batch"]
 Targets = Float[Array, " *batch"]
@@ -18,13 +23,13 @@ Plane = Float[Array, "2 m"]  # a point of the plane for each problem
 
 
 def two(points_a: Pair, points_b: Pair, target_a: Targets, target_b: Targets) -> Pair:
-    """The best weights of two bases, in closed form.
+    """Return the best weights of two bases, in closed form.
 
     Args:
         points_a: of both bases, from half a, any unit, shape [2,...].
-        points_b: from half b, likewise.
+        points_b: from half b, same shape.
         target_a: from half a, same unit, shape [...].
-        target_b: from half b, likewise.
+        target_b: from half b, same shape.
 
     Returns:
         the weights, shape [2,...]; one half each where the bases agree.
@@ -44,24 +49,24 @@ def two(points_a: Pair, points_b: Pair, target_a: Targets, target_b: Targets) ->
         raise ValueError(f"two takes 2 bases, got {len(points_a)}")
     u, c = plane(points_a, points_b, target_a, target_b)
     share = share_of(u[0], u[1], c)
-    return _unflatten(jnp.stack([1 - share, share]), points_a)
+    return jnp.stack([1 - share, share]).reshape(points_a.shape)
 
 
 def hull(
     points_a: Points, points_b: Points, target_a: Targets, target_b: Targets
 ) -> Weights:
-    """The best weights of any number of bases, exactly.
+    """Return the best weights of any number of bases, exactly.
 
     The ensemble of a pixel and channel is a point of the convex hull of the bases'
-    points. Outside the hull the nearest point lies on an edge, a closed form for every
-    pair. Inside, many weights reach the target: these are the ones nearest to uniform,
-    which makes them unique and smooth. Bases at the same point get the same weight.
+    points. For a target outside the hull the nearest point lies on an edge, a closed
+    form for every pair. Inside, many weights reach the target; the ones nearest to
+    uniform are unique and smooth. Bases at the same point get the same weight.
 
     Args:
         points_a: of each base, from half a, any unit, shape [N,...].
-        points_b: from half b, likewise.
+        points_b: from half b, same shape.
         target_a: from half a, same unit, shape [...].
-        target_b: from half b, likewise.
+        target_b: from half b, same shape.
 
     Returns:
         the weights, shape [N,...].
@@ -80,19 +85,19 @@ def hull(
     u, c = plane(points_a, points_b, target_a, target_b)
     if len(u) == 1:
         return jnp.ones_like(points_a)
-    return _unflatten(in_chunks(_nearest, u, c), points_a)
+    return in_chunks(_nearest, u, c).reshape(points_a.shape)
 
 
 def _nearest(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
-    """Weights of the point of the hull that is next to the target."""
-    w, least = _nearest_edge(u, c)
+    """Weights of the point of the hull that is nearest to the target."""
+    w, minimum = _nearest_edge(u, c)
     if len(u) > 2:
         around = _fan_triangle(u, c)
         found = jnp.sum(around, axis=0) > 0
         excess = _excess(jnp.sum(around[:, None] * u, axis=0), c)
-        # Also where a segment of two points within the hull hits the target.
+        # Also where a segment inside the hull hits the target.
         rounding = 8 * float(jnp.finfo(u.dtype).eps) * (1 + jnp.sum(jnp.abs(c), axis=0))
-        inside = found & (excess <= least + rounding)
+        inside = found & (excess <= minimum + rounding)
         if len(u) > 3:
             around = _nearest_uniform(u, c, around, inside)
         w = jnp.where(inside[None], around, w)
@@ -102,23 +107,10 @@ def _nearest(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
 def plane(
     points_a: Points, points_b: Points, target_a: Targets, target_b: Targets
 ) -> tuple[Float[Array, "n 2 m"], Plane]:
-    """Points of the plane relative to their mean, and it relative to the target.
+    """Return u_i = p_i - mean [N,2,M] and c = mean - t [2,M], divided by the largest u.
 
-    The target may be a firefly, far from all points: differences of points must not
-    go through it.
-
-    Args:
-        points_a: of each base, from half a, shape [N,...].
-        points_b: from half b, likewise.
-        target_a: from half a, shape [...].
-        target_b: from half b, likewise.
-
-    Returns:
-        u_i = p_i - mean, shape [N,2,M], and c = mean - t, shape [2,M], both divided by
-        the largest coordinate of u; 0 where some number is not finite.
-
-    Raises:
-        ValueError: while tracing, if there is no base or shapes differ.
+    The target may be a firefly, far from all points, and must not round differences of
+    points. Both are 0 in problems with a number that is not finite.
     """
     n, *batch = points_a.shape
     if n == 0:
@@ -145,23 +137,10 @@ def plane(
     return u * scale[None, None], (p[0] - t + offset) * scale[None]
 
 
-def _unflatten(w: Flat, like: Points) -> Weights:
-    """Weights with the batch axes of the points."""
-    return w.reshape(like.shape)
-
-
 def share_of(first: Plane, second: Plane, c: Plane) -> Float[Array, " m"]:
-    """Share of the second point in the point of the segment next to the target.
+    """Return the share of the second end at the point of a segment nearest to -c.
 
-    Args:
-        first: u of one end, shape [2,M].
-        second: u of the other end, likewise.
-        c: mean of the points relative to the target, shape [2,M].
-
-    Returns:
-        the share, in [0, 1], shape [M]; one half if both ends are the same.
-
-    Source: ED eq. 29.
+    One half if both ends are equal. Source: ED eq. 29.
     """
     d = second - first
     square = jnp.sum(d * d, axis=0)
@@ -173,42 +152,42 @@ def share_of(first: Plane, second: Plane, c: Plane) -> Float[Array, " m"]:
 
 
 def _excess(z: Plane, c: Plane) -> Float[Array, " m"]:
-    """|z + c|^2 - |c|^2, without derivatives: a far target drowns no difference."""
+    """|z + c|^2 - |c|^2, precise for a far target; without derivatives."""
     return lax.stop_gradient(jnp.sum(z * (z + 2 * c), axis=0))
 
 
 def _nearest_edge(
     u: Float[Array, "n 2 m"], c: Plane
 ) -> tuple[Flat, Float[Array, " m"]]:
-    """Weights of the point next to the target on all pairs' segments; its excess."""
+    """Weights of the point nearest to the target on all pairs' segments; its excess."""
     n, _, m = u.shape
-    least = jnp.full(m, jnp.inf, u.dtype)
-    share = jnp.zeros_like(least)
+    minimum = jnp.full(m, jnp.inf, u.dtype)
+    share = jnp.zeros_like(minimum)
     first = second = jnp.zeros(m, int)
     for i, j in itertools.combinations(range(n), 2):
         s = share_of(u[i], u[j], c)
         excess = _excess(u[i] + s[None] * (u[j] - u[i]), c)
-        better = excess < least
-        least = jnp.where(better, excess, least)
+        better = excess < minimum
+        minimum = jnp.where(better, excess, minimum)
         share = jnp.where(better, s, share)
         first, second = (
             jnp.where(better, k, old) for k, old in ((i, first), (j, second))
         )
     number = jnp.arange(n)[:, None]
     w = jnp.where(number == second[None], share[None], 0.0)
-    return jnp.where(number == first[None], 1 - share[None], w), least
+    return jnp.where(number == first[None], 1 - share[None], w), minimum
 
 
 def _fan_triangle(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
     """Weights of a triangle around the target, of sum one; 0 where there is none.
 
-    Triangles of the first point and any two others cover the hull; of those around the
-    target the largest is taken, for its rounding.
+    Triangles of the first point and any two others cover the hull. The largest one
+    around the target rounds least.
     """
     n, _, m = u.shape
 
     def cross(i: int, j: int) -> Array:
-        """Of p_i and p_j, p = u + c, of which c may be large."""
+        """Cross product of p_i and p_j, p = u + c, where c may be large."""
         d = u[j] - u[i]
         return u[i, 0] * d[1] - u[i, 1] * d[0] + c[0] * d[1] - c[1] * d[0]
 
@@ -223,7 +202,7 @@ def _fan_triangle(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
         largest = jnp.where(better, jnp.abs(area), largest)
         these = [corners.get(i, jnp.zeros_like(area)) for i in range(n)]
         w = jnp.where(better[None], jnp.abs(jnp.stack(these)), w)
-    # Of sum one, whatever the rounding of an area that almost vanishes.
+    # Sums to one, whatever the rounding of an area that almost vanishes.
     total = jnp.broadcast_to(jnp.sum(w, axis=0, keepdims=True), w.shape)
     return divide(w, total, where=total > 0)
 
@@ -231,20 +210,20 @@ def _fan_triangle(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
 def _nearest_uniform(
     u: Float[Array, "n 2 m"], c: Plane, start: Flat, inside: Bool[Array, " m"]
 ) -> Flat:
-    """The weights of least |w|^2 that reach a target inside the hull.
+    """The weights of minimum |w|^2 that reach a target inside the hull.
 
-    They are affine in the points where they are not zero: w_i = (l.r_i)+ with r_i the
-    point and a one. Where the points are too nearly on a line for that, the start.
+    Where positive they are affine in the points: w_i = (l.r_i)+, with r_i the point and
+    a one. Returns the start where the points are too nearly on a line for that.
     """
     rows, target = _orthonormal(u, c)
     near = 1e3 * float(jnp.finfo(u.dtype).eps)
 
     def multipliers(rows: Array, target: Array, free: Array) -> Array:
-        """Those for which the free weights reach the target."""
-        own = jnp.where(free[None], rows, 0.0)
-        square = jnp.sum(own[:, None] * own[None], axis=2)
-        least = jnp.full((3, 1), 1e-3 * near, u.dtype)
-        return cholesky.solve(square, target[:, None], least)[:, 0]
+        """The l for which the free weights reach the target."""
+        free_rows = jnp.where(free[None], rows, 0.0)
+        square = jnp.sum(free_rows[:, None] * free_rows[None], axis=2)
+        minimum_pivot = jnp.full((3, 1), 1e-3 * near, u.dtype)
+        return cholesky.solve(square, target[:, None], minimum_pivot)[:, 0]
 
     fixed_rows, fixed_target = lax.stop_gradient((rows, target))
 
@@ -267,9 +246,9 @@ def _nearest_uniform(
 def _orthonormal(
     u: Float[Array, "n 2 m"], c: Plane
 ) -> tuple[Float[Array, "3 n m"], Float[Array, "3 m"]]:
-    """Ones and both coordinates of all points as orthonormal rows; the target in them.
+    """Ones and both coordinates of the points as orthonormal rows; the target in them.
 
-    A coordinate without any extent, or of points on one line, becomes a row of zeros.
+    A coordinate that is constant, or the second one of points on a line, becomes zeros.
     """
     n = len(u)
     swapped = jnp.sum(jnp.abs(u[:, 0]) - jnp.abs(u[:, 1]), axis=0) < 0
@@ -277,10 +256,10 @@ def _orthonormal(
     x_target, y_target = (-jnp.where(swapped, c[1 - k], c[k]) for k in (0, 1))
     one = jnp.full_like(x, n**-0.5)
 
-    def unit(row: Array, along: Array, least: float) -> tuple[Array, Array]:
+    def unit(row: Array, along: Array, minimum: float) -> tuple[Array, Array]:
         square = jnp.sum(row * row, axis=0)
-        some = square > least
-        size = jnp.sqrt(jnp.where(some, square, 1.0))
+        some = square > minimum
+        size = safe_sqrt(square)
         known = jnp.broadcast_to(some[None], row.shape)
         row = divide(row, jnp.broadcast_to(size[None], row.shape), where=known)
         return row, divide(along, size, where=some)

@@ -1,4 +1,10 @@
-"""What both exact solvers share: which of N weights are not zero, and equal bases."""
+"""The search that both exact solvers share: which of N weights are positive.
+
+From feasible weights towards the minimum over the free ones, until one of them becomes
+zero and is fixed there; at the minimum the fixed weight with the steepest descent is
+freed. The function never rises, so no set is visited twice and the search ends, at the
+latest where rounding fixes a weight that was just freed.
+"""
 
 from collections.abc import Callable
 
@@ -11,21 +17,14 @@ from jscomb.numerics.guards import divide
 Flat = Float[Array, "n m"]  # weights of M problems
 Free = Bool[Array, "n m"]
 
-_STEPS = 16  # for each base; never needed but when rounding decides
+_STEPS = 16  # for each base; needed only where rounding decides
 _CHUNK = 4096
 
 
 def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
-    """Weights of many problems, some thousands at a time.
+    """Solve M problems, on the last axis of the arrays, some thousands at a time.
 
-    Those fit into the cache, and only they wait for the slowest among them.
-
-    Args:
-        function: of arrays with the problems on their last axis, to weights [N,M].
-        arrays: with M problems on their last axis.
-
-    Returns:
-        the weights, shape [N,M].
+    They fit into the cache, and only they wait for the slowest among them.
     """
     count = arrays[0].shape[-1]
     pieces = -(-count // _CHUNK)
@@ -41,28 +40,17 @@ def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
     return jnp.moveaxis(each, 0, 1).reshape(each.shape[1], -1)[:, :count]
 
 
-def least_weight(w: Flat) -> float:
-    """What a weight of zero may be by rounding.
+def minimum_weight(w: Flat) -> float:
+    """Return how far below zero rounding may move a weight of zero.
 
-    Args:
-        w: weights, for their precision.
-
-    Returns:
-        a number just below zero. A weight there stays free: on the line between two
-        others a third one has none, but may make room for a fourth.
+    Such a weight stays free: on the line between two others a third base has no
+    weight, but may make room for a fourth.
     """
     return -32 * float(jnp.finfo(w.dtype).eps)
 
 
-def is_sound(w: Flat) -> Bool[Array, " m"]:
-    """Whether weights have a sum of one, but for rounding.
-
-    Args:
-        w: weights of either sign, shape [N,M].
-
-    Returns:
-        False for a problem so far from convex that its minimum is lost, shape [M].
-    """
+def sums_to_one(w: Flat) -> Bool[Array, " m"]:
+    """Return False for problems so far from convex that their minimum is lost."""
     return jnp.abs(jnp.sum(w, axis=0) - 1) < 0.5
 
 
@@ -74,25 +62,18 @@ def search(
 ) -> tuple[Flat, Free]:
     """Minimise convex quadratic functions of nonnegative weights.
 
-    One that is not convex, so that a minimum is lost, keeps its start.
-
-    From feasible weights towards the minimum of the free ones, until one of them
-    becomes zero and is fixed; at the minimum the fixed weight with the steepest descent
-    is freed. The function never rises, so no set is visited twice and the search ends;
-    at the latest where rounding fixes a weight that has just been freed.
-
     Args:
-        minimise: of the free weights, to the minimum over them, 0 elsewhere, and the
+        minimise: from the free weights to the minimum over them, 0 elsewhere, and the
             derivative with respect to each weight there; a fixed one is freed if it is
             negative.
-        start: feasible weights, shape [N,M].
+        start: feasible weights, shape [N,M]; the result if a minimum is lost.
         free: the weights that are not fixed at zero there, shape [N,M].
-        active: problems to solve; the others keep their start.
+        active: problems to solve; the others return their start.
 
     Returns:
         the weights, and which of them are free.
     """
-    n, least = len(start), least_weight(start)
+    n, minimum_free = len(start), minimum_weight(start)
     number, start_free = jnp.arange(n)[:, None], free
 
     def unfinished(state: tuple) -> Array:
@@ -102,8 +83,8 @@ def search(
     def advance(state: tuple) -> tuple:
         step, w, free, fresh, active = state
         minimum, slope = minimise(free)
-        sound = is_sound(minimum) & jnp.all(jnp.isfinite(slope), axis=0)
-        blocking = free & (minimum < least)
+        solved = sums_to_one(minimum) & jnp.all(jnp.isfinite(slope), axis=0)
+        blocking = free & (minimum < minimum_free)
         reach = divide(w, w - minimum, where=blocking, otherwise=jnp.inf)
         share = jnp.minimum(jnp.min(reach, axis=0, keepdims=True), 1.0)
         fixed = blocking & (reach <= share)
@@ -111,7 +92,7 @@ def search(
         slope = jnp.where(free, jnp.inf, slope)
         arrived, steepest = share >= 1, jnp.argmin(slope, axis=0, keepdims=True)
         freed = arrived & (slope < 0) & (number == steepest)
-        moves, given_up = (active & sound)[None], (active & ~sound)[None]
+        moves, given_up = (active & solved)[None], (active & ~solved)[None]
         done = (arrived[0] & ~jnp.any(freed, axis=0)) | jnp.any(fresh & fixed, axis=0)
         after, free_after = jnp.where(moves, moved, w), (free & ~fixed) | freed
         return (
@@ -119,7 +100,7 @@ def search(
             jnp.where(given_up, start, after),
             jnp.where(given_up, start_free, jnp.where(moves, free_after, free)),
             freed,
-            active & sound & ~done,
+            active & solved & ~done,
         )
 
     state = (0, start, free, jnp.zeros_like(free), active)
@@ -128,14 +109,6 @@ def search(
 
 
 def shared_by_equals(w: Flat, equal: Bool[Array, "n n m"]) -> Flat:
-    """The same weight for bases that cannot be told apart.
-
-    Args:
-        w: weights, shape [N,M].
-        equal: which bases are equal, itself among them, shape [N,N,M].
-
-    Returns:
-        the weights, shape [N,M].
-    """
+    """Return the same weight for bases that are equal, each to itself too."""
     count = jnp.sum(equal, axis=1).astype(w.dtype)
     return jnp.sum(jnp.where(equal, w[None], 0.0), axis=1) / count

@@ -1,4 +1,4 @@
-"""jaxopt's OSQP, float64: what the other solvers are held against."""
+"""The general solver that the others are tested against: jaxopt's OSQP, float64."""
 
 import warnings
 
@@ -6,22 +6,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.numerics.simplex.hull import Points, Targets, Weights, plane
-from jscomb.numerics.simplex.quadratic import Matrix, objective_of
+from jscomb.numerics.simplex._hull import Points, Targets, Weights, plane
+from jscomb.numerics.simplex._quadratic import Matrix, objective_of
 
 
 def reference(
     points_a: Points, points_b: Points, target_a: Targets, target_b: Targets
 ) -> Weights:
-    """Weights of the least squares of `hull`, by a general solver.
+    """Solve the least squares of `hull` by a general solver. Slow.
 
-    Where many weights are as good these are any of them. Slow.
+    Where the minimum is not unique the weights are any of the best.
 
     Args:
         points_a: of each base, from half a, any unit, float64, shape [N,...].
-        points_b: from half b, likewise.
+        points_b: from half b, same shape.
         target_a: from half a, same unit, shape [...].
-        target_b: from half b, likewise.
+        target_b: from half b, same shape.
 
     Returns:
         the weights, shape [N,...].
@@ -43,7 +43,7 @@ def reference(
 
 
 def reference_quadratic(matrix: Matrix) -> Weights:
-    """Weights of least w'Mw, of `quadratic`, by a general solver.
+    """Minimise w'Mw of `quadratic` by a general solver.
 
     Args:
         matrix: M, any unit, float64, shape [N,N,...].
@@ -66,8 +66,8 @@ def reference_quadratic(matrix: Matrix) -> Weights:
 
 
 def _solve(matrix: Float[Array, "n n m"], linear: Float[Array, "n m"]) -> Array:
-    """Least w'Kw / 2 + r.w on the simplex, for each problem."""
-    with warnings.catch_warnings():  # it says on import that it is no longer developed
+    """Minimise w'Kw / 2 + r.w on the simplex, for each problem."""
+    with warnings.catch_warnings():  # on import, that it is no longer developed
         warnings.simplefilter("ignore", DeprecationWarning)
         from jaxopt import OSQP  # slow to import, and only tests need it
 

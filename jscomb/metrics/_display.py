@@ -1,8 +1,8 @@
-"""Errors of the displayed image, as somebody sees it.
+"""Errors of the displayed image.
 
 Layout: images [H,W,C], linear radiance, tone mapped here. `dssim` is pure and
-differentiable. `flip` and `hdr_flip` call NVIDIA's evaluator (extra `flip`) in a
-process of its own, because it ends the whole process on some input.
+differentiable. `flip` and `hdr_flip` call NVIDIA's evaluator (extra `flip`) in another
+process, because on some input it ends the process.
 """
 
 import importlib.util
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jscomb.metrics.errors import masked_mean, pair
+from jscomb.metrics._errors import counted, mean
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Mask, Scalar
 
@@ -23,7 +23,7 @@ _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
 
 def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
-    """Structural dissimilarity (1 - SSIM) / 2 of the displayed images.
+    """Return the structural dissimilarity (1 - SSIM) / 2 of the displayed images.
 
     Both are tone mapped (`tone_map`) first. Windows are Gaussian (11x11, sigma 1.5)
     and clipped to the image, so any size works.
@@ -31,7 +31,7 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
     Args:
         image: linear radiance, shape [H,W,C].
         reference: linear radiance, shape [H,W,C].
-        mask: pixels that count, and take part in windows, shape [H,W,1].
+        mask: pixels that count, also within windows, shape [H,W,1].
 
     Returns:
         the dissimilarity, 0 for equal images, at most 1.
@@ -49,8 +49,8 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
 
     Source: Wang et al. 2004, "Image quality assessment".
     """
-    image, reference = pair(image, reference, mask)
-    # The display would show an infinite pixel as white, and so hide it.
+    image, reference = counted(mask, image=image, reference=reference)
+    # Tone mapping would show an infinite pixel as white.
     bad = jnp.where(jnp.isfinite(image) & jnp.isfinite(reference), 0.0, jnp.nan)
     a, r = tone_map(image) + bad, tone_map(reference)
 
@@ -62,11 +62,11 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
     covariance = local(a * r) - mean_a * mean_r
     ssim = (2 * mean_a * mean_r + _SSIM_C1) * (2 * covariance + _SSIM_C2)
     ssim /= (mean_a**2 + mean_r**2 + _SSIM_C1) * (var_a + var_r + _SSIM_C2)
-    return masked_mean((1 - ssim) / 2, mask)
+    return mean((1 - ssim) / 2, mask)
 
 
 def tone_map(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Linear radiance to display values: filmic ACES curve, then the sRGB curve.
+    """Map linear radiance to display values: filmic ACES curve, then sRGB curve.
 
     Args:
         image: linear radiance, any shape; negative values count as 0.
@@ -89,7 +89,7 @@ def tone_map(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def flip(image: ArrayLike, reference: ArrayLike) -> float:
-    """Mean FLIP error of the displayed images, as seen when flipping between them.
+    """Return the mean FLIP error, visible when flipping between displayed images.
 
     Args:
         image: linear radiance, shape [H,W,3], tone mapped here (`tone_map`).
@@ -101,7 +101,7 @@ def flip(image: ArrayLike, reference: ArrayLike) -> float:
     Raises:
         ValueError: if a shape is wrong or a value is not finite.
         ImportError: if the evaluator is not installed.
-        RuntimeError: if the evaluator fails; holds what it said.
+        RuntimeError: if the evaluator fails; contains its output.
 
     Example:
         >>> grey = np.full((16, 16, 3), 0.2)
@@ -114,12 +114,12 @@ def flip(image: ArrayLike, reference: ArrayLike) -> float:
 
 
 def hdr_flip(image: ArrayLike, reference: ArrayLike) -> float:
-    """Mean HDR-FLIP error: the greatest FLIP over a range of exposures.
+    """Return the mean HDR-FLIP error: each pixel's maximum over display exposures.
 
     Args:
         image: linear radiance, shape [H,W,3]; negative values count as 0.
-        reference: linear radiance, shape [H,W,3]; not all black, since the range of
-            exposures comes from it.
+        reference: linear radiance, shape [H,W,3]; sets the range of exposures, so not
+            all black.
 
     Returns:
         the mean error in [0, 1]. Not differentiable, not for `jit`.
@@ -128,7 +128,7 @@ def hdr_flip(image: ArrayLike, reference: ArrayLike) -> float:
         ValueError: if a shape is wrong, a value is not finite, or the reference is
             all black.
         ImportError: if the evaluator is not installed.
-        RuntimeError: if the evaluator fails; holds what it said.
+        RuntimeError: if the evaluator fails; contains its output.
 
     Example:
         >>> grey = np.full((16, 16, 3), 0.2)
@@ -152,7 +152,7 @@ print("FLIP", repr(float(error)))
 
 
 def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> float:
-    """Validate, then evaluate in another process, which some input would end."""
+    """Validate and evaluate in another process."""
     arrays = {"image": np.asarray(image), "reference": np.asarray(reference)}
     for name, array in arrays.items():
         if array.shape != arrays["image"].shape or array.shape[2:] != (3,):
@@ -177,6 +177,6 @@ def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> flo
     )
     *_, word, value = (done.stdout.decode(errors="replace").split() or ["", ""])[-2:]
     if done.returncode or word != "FLIP":
-        said = (done.stdout + done.stderr).decode(errors="replace").strip()
-        raise RuntimeError(f"the FLIP evaluator failed ({done.returncode}): {said}")
+        output = (done.stdout + done.stderr).decode(errors="replace").strip()
+        raise RuntimeError(f"the FLIP evaluator failed ({done.returncode}): {output}")
     return float(value)
