@@ -179,7 +179,10 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
     ("arguments", "message"),
     [
         (["combine", "f.exr"], "-o PATH"),
-        (["combine", "f.exr", "-o", "o.exr", "--method", "median"], "--method median: exp"),
+        (
+            ["combine", "f.exr", "-o", "o.exr", "--method", "median"],
+            "--method median: exp",
+        ),
         (["demo", "--nope"], "--nope"),
         (["frobnicate"], "frobnicate"),
         ([], "demo, combine, compare, info"),
@@ -229,11 +232,23 @@ BAD = {
     "truncated": (truncated, [], r"cut\.exr: truncated or corrupt"),
     "missing": (lambda d: d / "no.exr", [], r"no\.exr: no such file"),
     "directory": (lambda d: d, [], "holds neither color.exr nor colorA.exr"),
-    "no variance": (without_statistics, ["--method", "whitened"], r"plain\.exr: whitened needs the variance, .*render with variances"),
+    "no variance": (
+        without_statistics,
+        ["--method", "whitened"],
+        r"plain\.exr: whitened needs the variance, .*render with variances",
+    ),
     "no samples": (moments, [], r"moments\.exr: .*give the samples a pixel"),
-    "several": (several, [], r"two\.exr: which biased image\? this frame has oidn, other"),
+    "several": (
+        several,
+        [],
+        r"two\.exr: which biased image\? this frame has oidn, other",
+    ),
     "count": (lambda d: GLASS, ["--samples", "-5"], "samples must be at least 1"),
-    "biased": (lambda d: GLASS, ["--biased", "nlm"], "neither a file, nor a denoiser, nor a biased"),
+    "biased": (
+        lambda d: GLASS,
+        ["--biased", "nlm"],
+        "neither a file, nor a denoiser, nor a biased",
+    ),
     "no image": (lambda d: GLASS, ["--biased", os.fspath(DATA)], "holds neither"),
 }
 

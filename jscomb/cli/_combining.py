@@ -242,4 +242,3 @@ def _with_biased(
         raise ValueError(f"{biased} is {image.shape}, {path} {frame.color.shape}")
     name = Path(biased).name
     return frame.with_estimate(name, Estimate(image)), name
-
