@@ -224,8 +224,8 @@ def _changed_parts(ours: Case, folder: pathlib.Path) -> Iterator[Case]:
     ):
         bare = [Part(p.name, p.channels, _ours(p.attributes)) for p in some]
         write_parts(str(path), bare)
-        held = ours.right if some is reordered else None
-        yield Case("parts removed, added, exchanged", path.read_bytes(), held)
+        right = ours.right if some is reordered else None
+        yield Case("parts removed, added, exchanged", path.read_bytes(), right)
 
 
 def _ours(attributes: dict[str, Any]) -> dict[str, Any]:
