@@ -3,8 +3,8 @@
     python -m experiments.choice FOLDER --results FILE.json
 
 Every archive in the folder (see `frames`), at every sample count: what
-`jscomb.methods.choose` takes, and the error (relative L2, less the reference's noise) of every
-method. The regret is the chosen method's error divided by the least of all.
+`jscomb.methods.choose` takes, and the error (relative L2, less the reference's noise)
+of every method. The regret is the chosen method's error divided by the least of all.
 """
 
 import dataclasses
