@@ -1,10 +1,20 @@
-"""A denoiser whose kernels a network predicts."""
+"""A denoiser whose kernels a network predicts.
 
-from collections.abc import Callable
+Each pixel becomes the mean of its window, with the network's weights, each divided by
+1 + v: without the division a firefly corrupts every window that contains it, and the
+network only learns to leave each pixel alone.
+
+Source: S. Bako et al., "Kernel-predicting convolutional networks for denoising Monte
+Carlo renderings", 2017; the division is ours.
+"""
+
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jscomb.features import stack
+from jscomb.frame import Frame, Needs
 from jscomb.numerics.guards import (
     check_same_shape,
     first_finite,
@@ -15,8 +25,14 @@ from jscomb.numerics.kernels import Kernels, predicted_mean
 from jscomb.numerics.luminance import at_unit_luminance
 from jscomb.typing import Image, Variance
 
+__all__ = ["NEEDS", "denoise", "denoise_inputs", "denoise_normalised", "neural_inputs"]
+
 Features = Float[Array, "h w f"]
 Network = Callable[[Image, Variance, Features], Kernels]
+
+_FEATURES = {"albedo": 3, "normal": 3, "depth": 1}  # channels
+
+NEEDS = Needs(variance=True, channels=3, features=tuple(_FEATURES), normalised=True)
 
 
 def denoise(
@@ -29,22 +45,20 @@ def denoise(
 ) -> Image:
     """Average each pixel's window with weights that a network predicts.
 
-    A pixel's weight is divided by 1 + v, with v normalised by the median luminance.
-
     Pure, scale-equivariant, and differentiable in every array and in the network's
-    parameters, forwards too (for SURE).
+    parameters, forwards too (for SURE). Divides radiance by its median luminance.
 
     Args:
-        network: of x, v and features, finite and normalised, to w² weights
-            a pixel, such as `learning.networks.KernelPredictor`.
+        network: from x, v and features, finite and normalised, to w² weights a pixel,
+            such as `learning.networks.KernelPredictor`.
         noisy: x, linear radiance, shape [H,W,C].
-        variance: v of the mean x, squared radiance, at least zero, likewise.
-        features: of a range of about one, shape [H,W,F]; `features.stack`.
+        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        features: about in [-1, 1], shape [H,W,F]; see `features.stack`.
         window: width of the windows in pixels, odd; the network's.
 
     Returns:
-        the denoised image, linear radiance, shape [H,W,C]; pixels that are not finite
-        in some input take no part and stay as they are, or 0.
+        the denoised image, linear radiance, shape [H,W,C]; invalid pixels are excluded
+        and unchanged, or 0 where x is not finite.
 
     Raises:
         ValueError: while tracing, if shapes differ, or the network has another window.
@@ -55,9 +69,6 @@ def denoise(
         >>> y = denoise(even, x, 0 * x, x[..., :0], window=3)
         >>> print([f"{value:.2f}" for value in y.ravel()])
         ['1.50', '3.00', '4.00']
-
-    Source: S. Bako et al., "Kernel-predicting convolutional networks for denoising
-    Monte Carlo renderings", 2017; the division is ours.
     """
     check_same_shape(noisy=noisy, variance=variance)
     denoise_one = lambda x, v: denoise_normalised(
@@ -81,8 +92,8 @@ def denoise_normalised(
     Args:
         network: as for `denoise`.
         noisy: x, normalised radiance, shape [H,W,C].
-        variance: v of the mean x, at least zero, likewise.
-        features: of a range of about one, shape [H,W,F].
+        variance: v of the mean x, at least zero, shape [H,W,C].
+        features: about in [-1, 1], shape [H,W,F].
         window: width of the windows in pixels, odd; the network's.
 
     Returns:
@@ -101,10 +112,64 @@ def denoise_normalised(
     check_same_shape(noisy=noisy, variance=variance)
     valid, x, v, f = zero_invalid(noisy, variance, features)
     kernels = network(x, v, f)
-    # Otherwise a firefly corrupts every window that contains it, and the network only
-    # learns to leave each pixel alone.
     trust = 1 / (1 + jnp.mean(v, axis=-1, keepdims=True))
     both = jnp.concatenate([trust * x, trust], axis=-1)
     (mean,) = predicted_mean(both[None], kernels, window, mask=valid)
     image = weighted_ratio(mean[..., :-1], mean[..., -1:])
     return jnp.where(valid, image, first_finite(noisy))
+
+
+def neural_inputs(frame: Frame) -> dict[str, Image]:
+    """Return what `denoise_inputs` takes of a frame.
+
+    Args:
+        frame: normalised, with variance, albedo, normal and depth.
+
+    Returns:
+        noisy and variance, shape [H,W,3], albedo, normal and depth, scaled to at most
+        one.
+
+    Raises:
+        ValueError: if the frame lacks any of them.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one, three = jnp.ones((2, 2, 1)), jnp.ones((2, 2, 3))
+        >>> features = {"albedo": three, "normal": three, "depth": 5 * one}
+        >>> frame = make_frame(three, variance=three, **features).normalised()
+        >>> print(neural_inputs(frame)["depth"][0, 0])
+        [1.]
+    """
+    frame.require("a kernel predictor", NEEDS)
+    images = {"noisy": frame.color, "variance": frame.variance}
+    features, first = stack(frame), 0
+    for name, channels in _FEATURES.items():
+        images[name] = features[..., first : first + channels]
+        first += channels
+    return images
+
+
+def denoise_inputs(
+    network: Network, inputs: Mapping[str, Image], *, window: int = 11
+) -> Image:
+    """Denoise what `neural_inputs` returns, or crops of it.
+
+    Args:
+        network: as for `denoise`.
+        inputs: images by name, normalised.
+        window: width of the windows in pixels, odd; the network's.
+
+    Returns:
+        the denoised image, normalised radiance, shape [H,W,3].
+
+    Example:
+        >>> even = lambda x, v, f: Kernels(x, lambda i: jnp.ones((*i.shape[:2], 9)), 0)
+        >>> x = jnp.broadcast_to(jnp.array([1.0, 2.0, 6.0])[:, None], (1, 3, 3))
+        >>> names = "noisy", "variance", "albedo", "normal", "depth"
+        >>> inputs = dict(zip(names, [x, 0 * x, x, x, x[..., :1]], strict=True))
+        >>> print(denoise_inputs(even, inputs, window=3)[0, :, 0])
+        [1.5 3.  4. ]
+    """
+    features = jnp.concatenate([inputs[name] for name in _FEATURES], axis=-1)
+    noisy, variance = inputs["noisy"], inputs["variance"]
+    return denoise_normalised(network, noisy, variance, features, window=window)

@@ -1,6 +1,5 @@
 """Double shrinkage of a normalised frame and an estimate of another integrator."""
 
-import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from jscomb.double_shrinkage._neural import KERNEL, Network, combine_inputs
 from jscomb.double_shrinkage._prior import blend_prior
 from jscomb.features import select, stack
 from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
-from jscomb.numerics.tiles import Local, compiled
+from jscomb.numerics.tiles import Local, compiled, network_plan
 from jscomb.typing import Image
 
 NEEDS = Needs(variance=True, halves=True, normalised=True)
@@ -237,14 +236,8 @@ def plan_neural(
         >>> print(plan_neural(network, frame, Estimate(x[0], x)).whole().shape)
         (4, 4, 3)
     """
-    reach = getattr(network, "reach", None)
-    return Local(
-        functools.partial(compiled(combine_inputs), network),
-        neural_inputs(frame, estimate, stride=stride),
-        # The maximum, not the sum: a pixel's kernels come from the network there.
-        halo=None if reach is None else max(reach, KERNEL // 2),
-        multiple=getattr(network, "multiple", 1),
-    )
+    inputs = neural_inputs(frame, estimate, stride=stride)
+    return network_plan(combine_inputs, network, inputs, kernel=KERNEL)
 
 
 def neural_combine_frame(

@@ -1,4 +1,4 @@
-"""What the commands print."""
+"""Tables that the commands print."""
 
 import functools
 from collections.abc import Mapping
@@ -14,8 +14,8 @@ def errors(images: Mapping[str, Image], frame: Frame) -> dict[str, str]:
     assert frame.reference is not None
     r, noise = frame.reference
     mask = finite(r, *images.values())
-    if left_out := int((~mask).sum()):
-        print(f"{left_out} of {mask.size} pixels are not finite and were left out")
+    if excluded := int((~mask).sum()):
+        print(f"{excluded} of {mask.size} pixels are not finite and were excluded")
     error = functools.partial(metrics.rel_l2, half_difference=noise, mask=mask)
     return {name: f"{float(error(image, r)):.5f}" for name, image in images.items()}
 

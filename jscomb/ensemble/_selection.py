@@ -1,4 +1,4 @@
-"""Which bases a frame needs."""
+"""Which bases lower a frame's error."""
 
 import functools
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jscomb.ensemble.errors import Bases, Matrix, check_bases, evidence_of, unpacked
+from jscomb.ensemble._estimate import Bases, Matrix, check_bases, evidence_of, unpacked
 from jscomb.numerics import simplex
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image
@@ -18,7 +18,7 @@ _ROUNDING = 1e-6
 
 
 class Selected(NamedTuple):
-    """Which bases an ensemble needs.
+    """The bases that an ensemble needs.
 
     Attributes:
         kept: their numbers, ascending.
@@ -40,19 +40,19 @@ def select_bases(
 ) -> Selected:
     """Drop bases without which the estimated error of the whole frame does not rise.
 
-    Weights from one half's errors are judged by the other's, so a base that only fits
-    noise shows. One base after the other, each time the one with the greatest gain.
-    Decides on values, so it is not for `jit`.
+    Weights from one half's errors are judged by the other's, which exposes a base that
+    only fits noise. Drops one base at a time, the one with the maximum gain. Decides
+    on values, so it is not for `jit`.
 
     Args:
         biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
-        biased_b: y^b, likewise of half b.
+        biased_b: y^b, made from half b.
         unbiased_a: x_a, shape [H,W,C].
-        unbiased_b: x_b, likewise.
+        unbiased_b: x_b, same shape.
         window: width in pixels that errors are averaged over, odd.
 
     Returns:
-        what is left, and what that does to the error.
+        the bases that remain, and the estimated errors on the way.
 
     Raises:
         ValueError: if shapes differ or there is no base.
@@ -72,7 +72,7 @@ def select_bases(
     while len(kept) > 1:
         without = {i: _judged(halves, [k for k in kept if k != i]) for i in kept}
         worst = min(without, key=lambda i: without[i])
-        # A base without weight changes the error by rounding alone.
+        # A base without weight changes the error by rounding only.
         if without[worst] > errors[-1] + _ROUNDING * abs(errors[-1]):
             break
         kept.remove(worst)
@@ -89,7 +89,7 @@ def _halves(
     *,
     window: int,
 ) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Of both halves the errors over windows, and of single pixels."""
+    """Windowed error matrices of each half, then those of single pixels."""
     images = biased_a, biased_b, unbiased_a, unbiased_b
     a, b, valid = evidence_of(*images, shared=True)
     near = (window_mean(half, window, mask=valid) for half in (a, b))
@@ -99,7 +99,7 @@ def _halves(
 
 
 def _judged(halves: tuple[Matrix, ...], kept: Sequence[int]) -> float:
-    """Error over the frame of weights found by one half, as the other sees it."""
+    """Error over the frame of weights from one half, estimated by the other."""
     some = np.array(kept)
     near_a, near_b, a, b = (m[some[:, None], some[None]] for m in halves)
     return float(_cross_error(near_a, b) + _cross_error(near_b, a)) / 2

@@ -1,14 +1,19 @@
-"""What the halves tell of the bases' errors: matrices, of pixels and of windows."""
+"""Error matrices of the bases from half buffers, of pixels and of windows."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.guards import (
+    check_same_shape,
+    divide,
+    masked_mean,
+    safe_sqrt,
+    zero_invalid,
+)
 from jscomb.numerics.medians import median_of
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Mask
@@ -17,7 +22,8 @@ Bases = Float[Array, "n h w c"]
 Matrix = Float[Array, "n n h w _"]
 Packed = Float[Array, "h w _"]  # upper triangles of matrices
 
-_LEAST = 0.01  # of the frame's mean radiance squared; keeps black pixels from deciding
+# Added to squared radiances, of the frame's mean squared: limits black pixels.
+_FLOOR = 0.01
 SCALES = 11, 21, 41, 81
 
 
@@ -28,9 +34,9 @@ def mse_matrix(
 
     Args:
         biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
-        biased_b: y^b, likewise of half b.
+        biased_b: y^b, made from half b.
         unbiased_a: x_a, shape [H,W,C].
-        unbiased_b: x_b, likewise.
+        unbiased_b: x_b, same shape.
 
     Returns:
         `<M>`, squared radiance, shape [N,N,H,W,C].
@@ -91,7 +97,7 @@ def error_matrix(
     whole_frame: bool = True,
     shared: bool = True,
 ) -> Matrix:
-    """Estimate the error matrix over windows, as local as the halves can tell.
+    """Estimate the error matrix over windows, as local as the halves agree.
 
     From the largest scale to the smallest each window's mean is taken as far as both
     halves agree, within the larger window, on how it differs from that:
@@ -100,9 +106,9 @@ def error_matrix(
 
     Args:
         biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
-        biased_b: y^b, likewise of half b.
+        biased_b: y^b, made from half b.
         unbiased_a: x_a, shape [H,W,C].
-        unbiased_b: x_b, likewise.
+        unbiased_b: x_b, same shape.
         windows: widths in pixels, odd, ascending. One of them without `whole_frame`
             gives the plain mean over that window.
         whole_frame: the frame is the largest scale.
@@ -134,11 +140,8 @@ def error_matrix(
         for window in windows
     ]
     if whole_frame:
-        count = jnp.maximum(jnp.sum(valid), 1).astype(a.dtype)
-        total = lambda half: jnp.sum(half, axis=(0, 1), keepdims=True) / count
-        means.append(
-            tuple(jnp.broadcast_to(total(half), half.shape) for half in (a, b))
-        )
+        whole = lambda half: masked_mean(half, valid, per_channel=True)
+        means.append(tuple(jnp.broadcast_to(whole(h), h.shape) for h in (a, b)))
     larger_a, larger_b = means[-1]
     kept = (larger_a + larger_b) / 2
     pools = [*windows[1:], None]
@@ -154,11 +157,11 @@ def error_matrix(
 def _agreement(
     a: Packed, b: Packed, pool: int | None, valid: Mask
 ) -> Float[Array, "h w 1"]:
-    """How much of what both halves say is not noise, in [0, 1], [H,W,1]."""
+    """The share of both halves' difference that is not noise, in [0, 1], [H,W,1]."""
     spread = jnp.mean(jnp.square(a) + jnp.square(b), axis=(0, 1), keepdims=True)
-    some = spread > 0  # no bad base's elements shall decide alone
-    scale = jnp.where(some, jax.lax.rsqrt(jnp.where(some, spread, 1.0)), 0.0)
-    a, b = a * scale, b * scale
+    # Each element relative to its spread, or those of a bad base would dominate.
+    spread = jnp.broadcast_to(safe_sqrt(spread), a.shape)
+    a, b = (divide(i, spread, where=spread > 0) for i in (a, b))
     both = jnp.sum(a * b, axis=-1, keepdims=True)
     square = jnp.sum(jnp.square((a + b) / 2), axis=-1, keepdims=True)
     if pool is None:
@@ -172,14 +175,14 @@ def _agreement(
 
 
 class Evidence(NamedTuple):
-    """What each half says of all pairs of bases: upper triangles of <M>, relative.
+    """Upper triangles of <M> from each half, relative to the radiance.
 
-    In excess of the plain average's error, so that the noise of x, which all elements
-    have in common, drowns nothing.
+    In excess of the plain average's error, so that the noise of x, which is common to
+    all elements, does not dominate.
 
     Attributes:
         a: of <M>^a, [H,W,P*C] with P pairs; without unit.
-        b: of <M>^b, likewise.
+        b: of <M>^b, same shape.
         valid: pixels that are finite in all images, [H,W,1].
     """
 
@@ -195,34 +198,18 @@ def evidence_of(
     unbiased_b: Image,
     shared: bool,
 ) -> Evidence:
-    """What each half says of all pairs of bases.
+    """Estimate <M>^a and <M>^b at every pixel, relative to its radiance.
 
-    Relative to the pixel's radiance, so that no bright region decides for all.
-
-    Args:
-        biased_a: y^a, shape [N,H,W,C].
-        biased_b: y^b, likewise.
-        unbiased_a: x_a, shape [H,W,C].
-        unbiased_b: x_b, likewise.
-        shared: the mean of all channels, else each by itself.
-
-    Returns:
-        upper triangles of <M>^a and <M>^b; 0 at invalid pixels.
+    Channels are averaged if `shared`; 0 at invalid pixels.
     """
-    valid = finite(unbiased_a, unbiased_b, *biased_a, *biased_b)
     rows, columns = np.triu_indices(len(biased_a))
-
-    def clean(image: Array) -> Array:
-        mask = valid if image.ndim == 3 else valid[None]
-        return jnp.where(mask, image, 0.0)
-
-    y_a, y_b, x_a, x_b = map(clean, (biased_a, biased_b, unbiased_a, unbiased_b))
+    images = biased_a, biased_b, unbiased_a, unbiased_b
+    valid, y_a, y_b, x_a, x_b = zero_invalid(*images)
     means = jnp.mean(y_a, axis=0), jnp.mean(y_b, axis=0)
-    # The median: one base may carry a light's glow far beyond the light.
+    # The median: one base may spread the glow of a light far beyond it.
     typical = (median_of(y_a) + median_of(y_b)) / 2
     bright = jnp.mean(typical, axis=-1, keepdims=True)
-    count = jnp.maximum(jnp.sum(valid), 1).astype(bright.dtype)
-    square = jnp.square(bright) + _LEAST * jnp.square(jnp.sum(bright) / count)
+    square = jnp.square(bright) + _FLOOR * jnp.square(masked_mean(bright, valid))
     scale = jnp.broadcast_to(square, x_a.shape)
 
     def one(y: Bases, mean: Image, truth: Image) -> Packed:
@@ -237,15 +224,7 @@ def evidence_of(
 
 
 def unpacked(upper: Packed, n: int) -> Matrix:
-    """Symmetric matrices from their upper triangles.
-
-    Args:
-        upper: shape [H,W,P*C], P = N (N + 1) / 2.
-        n: N.
-
-    Returns:
-        the matrices, shape [N,N,H,W,C].
-    """
+    """Symmetric matrices [N,N,H,W,C] from their upper triangles."""
     place = np.zeros((n, n), int)
     place[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
     pairs = jnp.moveaxis(upper.reshape(*upper.shape[:2], n * (n + 1) // 2, -1), 2, 0)
@@ -253,20 +232,7 @@ def unpacked(upper: Packed, n: int) -> Matrix:
 
 
 def check_bases(biased_a: Bases, biased_b: Bases, x_a: Image, x_b: Image) -> None:
-    """Raise unless there is a base and all images have one shape.
-
-    Args:
-        biased_a: to be [N,H,W,C].
-        biased_b: to be of the same shape.
-        x_a: to be [H,W,C].
-        x_b: likewise.
-
-    Returns:
-        nothing.
-
-    Raises:
-        ValueError: while tracing; names the array and both shapes.
-    """
+    """Raise unless there is a base and all images have one shape."""
     check_same_shape(unbiased_a=x_a, unbiased_b=x_b)
     for name, bases in {"biased_a": biased_a, "biased_b": biased_b}.items():
         if bases.ndim != 4 or len(bases) == 0:

@@ -1,9 +1,9 @@
-"""EXR files as plain parts, with a guard around OpenEXR's Python binding.
+"""Read and write EXR files as plain parts; guard OpenEXR's Python binding.
 
-What the guard is for (OpenEXR 3.5): a truncated file opens with fewer parts and only a
-printed warning; a small file can claim gigabytes; arrays that are not contiguous are
-written wrong without a word; a failed write leaves half a file; a dict handed over is
-changed; exceptions are of any type.
+The binding (3.5) opens a truncated file with fewer parts and only a printed warning;
+lets a small file claim gigabytes; writes non-contiguous arrays wrongly without an
+error; leaves half a file behind a failed write; changes a dict that it is given; raises
+exceptions of any type.
 """
 
 import contextlib
@@ -16,18 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-MAX_BYTES = 8 * 2**30  # of all pixels of a file, in memory, unless asked otherwise
-MAX_TILE_BYTES = 2**28  # however much is asked for
-_BYTES = 4
+MAX_BYTES = 8 * 2**30  # default limit for all pixels of a file, in memory
+MAX_TILE_BYTES = 2**28  # limit of a tile, whatever `max_bytes` is
+_BYTES = 4  # a pixel of a channel
 
 
 class Part(NamedTuple):
     """One part of an EXR file.
 
     Attributes:
-        name: of the part; empty in single-part files.
-        channels: pixels by channel name, [H,W] each, over the display window; NaN
-            where the file's data window holds none.
+        name: empty in single-part files.
+        channels: pixels by channel name, [H,W] each, of the display window; NaN
+            outside the data window.
         attributes: header attributes by name.
     """
 
@@ -39,24 +39,14 @@ class Part(NamedTuple):
 def read_parts(
     path: str, *, header_only: bool = False, max_bytes: int = MAX_BYTES
 ) -> list[Part]:
-    """Read a file whole, or not at all.
+    """Return the parts of a complete file of flat images, or raise.
 
-    Args:
-        path: an EXR file.
-        header_only: leave out the pixels: channels come back empty.
-        max_bytes: that the pixels may take in memory, as 32-bit numbers; refused by
-            what the header claims, before any pixel is read.
-
-    Returns:
-        its parts in order.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a whole EXR file of flat images; says why.
+    `header_only` leaves `channels` empty; `max_bytes` limits the memory that the header
+    claims for 32-bit pixels, before any pixel is read.
     """
     if not os.path.exists(path):
         raise FileNotFoundError(f"{path}: no such file")
-    if not os.path.isfile(path):  # a pipe would be waited for
+    if not os.path.isfile(path):  # reading a pipe would block
         raise ValueError(f"{path}: is not a file")
     headers = _open(path, header_only=True).parts
     for part in headers:
@@ -74,24 +64,13 @@ def read_parts(
 
 
 def write_parts(path: str, parts: list[Part]) -> None:
-    """Write a file atomically, ZIP compressed.
-
-    Args:
-        path: the file; replaced only by a whole one.
-        parts: at least one; channels [H,W] in float16 or float32.
-
-    Returns:
-        nothing.
-
-    Raises:
-        OSError: if it cannot be written; what was at `path` is still there.
-    """
+    """Write channels [H,W], float16 or float32, atomically and ZIP compressed."""
     folder = os.path.dirname(path) or "."
     if not os.path.isdir(folder):
-        raise FileNotFoundError(f"{path}: there is no folder {folder}")
+        raise FileNotFoundError(f"{path}: the folder {folder} does not exist")
     if os.path.isdir(path):
         raise IsADirectoryError(f"{path}: is a folder")
-    file = OpenEXR.File([_native(part) for part in parts])
+    file = OpenEXR.File([_to_openexr(part) for part in parts])
     temporary = os.path.join(folder, f".jscomb-{uuid.uuid4().hex}.exr")
     try:
         with _silence():
@@ -106,31 +85,20 @@ def write_parts(path: str, parts: list[Part]) -> None:
 
 
 def stack(part: Part, layer: str, suffixes: str) -> np.ndarray | None:
-    """Channels of one layer as an image.
-
-    Args:
-        part: of a file.
-        layer: prefix before the dot; empty for channels without one.
-        suffixes: channel letters in order, such as "RGB".
-
-    Returns:
-        the image [H,W,C], C = len(suffixes), in float32; None if a channel is missing.
-    """
-    names = [f"{layer}.{s}" if layer else s for s in suffixes]
+    """Return channels of a layer as float32 [H,W,C]; None if one is missing."""
+    names = channel_names(layer, suffixes)
     if not all(name in part.channels for name in names):
         return None
     return np.stack([part.channels[n].astype(np.float32) for n in names], axis=-1)
 
 
+def channel_names(layer: str, suffixes: str) -> list[str]:
+    """Return the names of a layer's channels; the layer "" has no prefix."""
+    return [f"{layer}.{s}" if layer else s for s in suffixes]
+
+
 def layers(part: Part) -> dict[str, str]:
-    """Layer prefixes of a part.
-
-    Args:
-        part: of a file.
-
-    Returns:
-        the sorted last letters of each layer's channels, by prefix.
-    """
+    """Return the sorted channel suffixes of each layer, by the layer's name."""
     found: dict[str, str] = {}
     for name in sorted(part.channels):
         prefix, _, suffix = name.rpartition(".")
@@ -139,7 +107,7 @@ def layers(part: Part) -> dict[str, str]:
 
 
 def _open(path: str, *, header_only: bool) -> OpenEXR.File:
-    """The binding's reader, its many exceptions made one and its prints silent."""
+    """Open a file silently, with one type of exception for the binding's many."""
     try:
         with _silence():
             return OpenEXR.File(path, separate_channels=True, header_only=header_only)
@@ -151,19 +119,19 @@ def _open(path: str, *, header_only: bool) -> OpenEXR.File:
 
 
 def _size(header: dict[str, Any], window: str) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the data or display window."""
+    """Return left, top, width and height of the data or display window."""
     (x0, y0), (x1, y1) = (corner.tolist() for corner in header[window])
     return x0, y0, x1 - x0 + 1, y1 - y0 + 1
 
 
 def _claimed_bytes(header: dict[str, Any]) -> int:
-    """Memory that a part would take."""
+    """Return the memory that a part would take."""
     areas = [w * h for _, _, w, h in (_size(header, n) for n in _WINDOWS)]
     return max(areas) * len(header["channels"]) * _BYTES
 
 
 def _check_claims(path: str, headers: list[dict[str, Any]], max_bytes: int) -> None:
-    """Refuse what would take too much memory, before any pixel is read."""
+    """Raise if the file would take too much memory, before any pixel is read."""
     claimed = sum(_claimed_bytes(header) for header in headers)
     if claimed > max_bytes:
         raise ValueError(
@@ -187,23 +155,21 @@ _WINDOWS = ("dataWindow", "displayWindow")
 
 
 def _check_header(path: str, header: dict[str, Any]) -> None:
-    """Refuse what cannot be read as flat images, before any pixel is."""
+    """Raise unless the part is a flat image, before any pixel is read."""
     for window in _WINDOWS:
         _, _, width, height = _size(header, window)
         if width < 1 or height < 1:
-            raise ValueError(
-                f"{path}: its {window} is {width}x{height}, so not an image"
-            )
+            raise ValueError(f"{path}: {window} is {width}x{height}, not an image")
     kind = header.get("type", OpenEXR.scanlineimage)
     if kind not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-        raise ValueError(f"{path}: deep images are not supported, only flat ones")
+        raise ValueError(f"{path}: deep images are not supported, only flat images")
     for channel in header["channels"]:
         if (channel.xSampling, channel.ySampling) != (1, 1):
             raise ValueError(f"{path}: channel {channel.name} is subsampled")
 
 
 def _placed(path: str, part: OpenEXR.Part) -> Part:
-    """A part's pixels laid onto its display window: crops padded, overscan cut."""
+    """Return a part on its display window: crops padded with NaN, overscan cut off."""
     left, top, width, height = _size(part.header, "dataWindow")
     x0, y0, full_width, full_height = _size(part.header, "displayWindow")
     channels = {}
@@ -211,7 +177,7 @@ def _placed(path: str, part: OpenEXR.Part) -> Part:
         pixels = channel.pixels
         if pixels.shape != (height, width):
             raise ValueError(
-                f"{path}: channel {name} has {pixels.shape} pixels, its data window "
+                f"{path}: channel {name} has {pixels.shape} pixels, the data window "
                 f"{(height, width)}"
             )
         if pixels.dtype == np.uint32:
@@ -227,14 +193,14 @@ def _placed(path: str, part: OpenEXR.Part) -> Part:
 
 
 def _overlap(start: int, size: int, to: int, to_size: int) -> tuple[slice, slice]:
-    """The common range of two intervals, counted from each one's start."""
+    """Return the common range of two intervals, from the start of each."""
     first = max(start, to)
     last = max(first, min(start + size, to + to_size))
     return slice(first - start, last - start), slice(first - to, last - to)
 
 
-def _native(part: Part) -> OpenEXR.Part:
-    """The binding's part: contiguous pixels, and a header of its own."""
+def _to_openexr(part: Part) -> OpenEXR.Part:
+    """Return the binding's part: contiguous pixels, and a header of its own."""
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -246,16 +212,13 @@ def _native(part: Part) -> OpenEXR.Part:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Send what the binding prints to nowhere; the guard says it in one line instead.
-
-    It prints warnings to Python's standard output and errors to C's standard error.
-    """
+    """Discard what the binding prints to Python's stdout and to C's stderr."""
     sys.stderr.flush()
-    kept = os.dup(2)
+    stderr = os.dup(2)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
         os.dup2(nowhere.fileno(), 2)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(stderr, 2)
+            os.close(stderr)

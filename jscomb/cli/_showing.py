@@ -1,4 +1,4 @@
-"""`jscomb demo`, `compare` and `info`: what there is, and how good it is."""
+"""`jscomb demo`, `compare` and `info`."""
 
 import functools
 import os
@@ -11,9 +11,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jscomb import choice, exr, metrics
-from jscomb.cli import tables
-from jscomb.cli.combining import FramePath, SampleCount, choose
+from jscomb import exr, methods, metrics
+from jscomb.cli import _tables as tables
+from jscomb.cli._combining import FramePath, SampleCount, choose
 from jscomb.denoisers import oidn
 from jscomb.exr import dialects
 from jscomb.frame import Frame, Reference
@@ -21,11 +21,12 @@ from jscomb.numerics.guards import finite
 from jscomb.typing import Image
 
 TIMED_RUNS = 7
+SHOWN = "denoised", "james-stein", "whitened", "njs", "pd", "dsc"
 _DEMO_FOLDER = Path("jscomb-demo")
 
 
 def demo(*, out: Path = _DEMO_FOLDER) -> None:
-    """Combine the bundled frames and show the error of every method.
+    """Combine the bundled frames and print the error of the combiners.
 
     The frames are of one scene, path traced with 64 and with 1024 samples a pixel, and
     denoised by Open Image Denoise.
@@ -42,7 +43,7 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     for name, frame in by_samples:
         spp = f"{tables.samples(frame)} spp"
         print(f"{spp}:")
-        chosen = choose(frame, "oidn", None)
+        chosen = choose(frame, None, None)
         combined, ms = _all_methods(frame)
         for method, image in combined.items():
             exr.write_image(out / f"{name}-{method}.exr", image)
@@ -52,7 +53,7 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     size = tables.size(by_samples[0][1])
     print(f"relative L2 of one scene, {size}, and the time of each step")
     tables.print_table({**table, "ms": ms})
-    print("kept is the image by Open Image Denoise, and its time.")
+    print("denoised is the image by Open Image Denoise, and its time.")
     picture = out / "comparison.png"
     plots.comparison(picture, shown)
     print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
@@ -72,8 +73,8 @@ def compare(image: FramePath, reference: FramePath, /) -> None:
     if a.shape != r.shape:
         raise ValueError(f"{image} is {a.shape}, {reference} is {r.shape}")
     mask = finite(a, r)
-    left_out = int((~mask).sum())
-    if left_out == mask.size:
+    excluded = int((~mask).sum())
+    if excluded == mask.size:
         raise ValueError(f"{image} and {reference} have no finite pixel in common")
     rows: dict[str, Any] = {"relative L2": metrics.rel_l2(a, r, mask=mask)}
     if noise is not None:
@@ -87,11 +88,11 @@ def compare(image: FramePath, reference: FramePath, /) -> None:
         try:
             rows[name] = measure(a, r)
         except (ValueError, ImportError, RuntimeError) as error:
-            print(f"{name:>40}  not measured: {error}")
+            print(f"{name:>40}  skipped: {error}")
     for name, value in rows.items():
         print(f"{name:>40}  {float(value):.6g}")
-    if left_out:
-        print(f"{left_out} of {mask.size} pixels are not finite and were left out")
+    if excluded:
+        print(f"{excluded} of {mask.size} pixels are not finite and were excluded")
 
 
 def info(frame: FramePath, /, *, samples: SampleCount = None) -> None:
@@ -115,11 +116,11 @@ def info(frame: FramePath, /, *, samples: SampleCount = None) -> None:
     spp = tables.samples(loaded)
     print(f"  samples         {spp} a pixel in {count} sub-buffer(s)")
     print(f"  invalid pixels  {invalid}")
-    print(f"  exposure        {float(loaded.median_luminance):.4g} (median radiance)")
+    print(f"  median luminance {float(loaded.median_luminance):.4g}")
     stored: dict[str, Any] = {
         n: b for n, b in loaded.buffers._asdict().items() if b is not None
     }
-    stored |= {f"biased {name}": b.image for name, b in loaded.estimates.items()}
+    stored |= {f"biased {name}": e.image for name, e in loaded.estimates.items()}
     if loaded.reference is not None:
         stored["reference"] = loaded.reference.image
     for name, buffer in stored.items():
@@ -136,21 +137,21 @@ def info(frame: FramePath, /, *, samples: SampleCount = None) -> None:
 def _all_methods(frame: Frame) -> tuple[dict[str, Image], dict[str, str]]:
     """Combinations of a denoised frame, and the milliseconds that each takes."""
     images, ms = {}, {}
-    for method in choice.METHODS:
-        make = lambda frame, method=method: choice.combine(
-            jax.random.key(0), frame, "oidn", method=method
-        )
+    for method in SHOWN:
+        make = lambda frame, method=method: methods.plan(
+            jax.random.key(0), frame, method=method, biased=None
+        ).whole()
         try:
             images[method], time_of_one = _timed(make, frame)
         except ImportError as error:
-            print(f"{method}: {error}")
+            print(f"{method}: skipped: {error}")
             continue
         ms[method] = f"{time_of_one:.1f}"
-    ms[choice.KEEP] = ""  # its time is the denoiser's, where that is installed
+    ms["denoised"] = ""  # its time is the denoiser's, where that is installed
     if oidn.available():
         guides = {"albedo": frame.albedo, "normal": frame.normal}
         denoise = functools.partial(oidn.denoise, **guides)
-        ms[choice.KEEP] = f"{_timed(denoise, frame.color)[1]:.1f}"
+        ms["denoised"] = f"{_timed(denoise, frame.color)[1]:.1f}"
     return images, ms
 
 

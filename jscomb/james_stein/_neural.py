@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.james_stein.shrinkage import combine
+from jscomb.james_stein._combine import combine
 from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
 from jscomb.numerics.kernels import Kernels, predicted_mean
 from jscomb.numerics.luminance import at_unit_luminance
@@ -127,7 +127,8 @@ def neural_combine_normalised(
         >>> x, y = jnp.full((4, 4, 1), 3.0), jnp.ones((4, 4, 1))
         >>> even = Kernels(x, lambda near: jnp.ones((*near.shape[:2], 15**2)), 0)
         >>> network = lambda *_: Parameters(even, 0.5 * y)
-        >>> print(neural_combine_normalised(network, x, y, y, y, window=3)[0, 0].round(3))
+        >>> z = neural_combine_normalised(network, x, y, y, y, window=3)
+        >>> print(z[0, 0].round(3))
         [2.674]
 
     Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.

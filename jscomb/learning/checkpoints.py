@@ -1,4 +1,4 @@
-"""Arrays of a tree, such as a network, as a safetensors file and back."""
+"""The arrays of a pytree, such as a network, as a safetensors file and back."""
 
 import os
 import pathlib
@@ -9,13 +9,15 @@ import jax.numpy as jnp
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+__all__ = ["load", "save"]
+
 Tree = TypeVar("Tree")
 
 
 def save(path: pathlib.Path, tree: Any) -> pathlib.Path:
-    """Write all arrays of a tree under their names in it.
+    """Write the arrays of a tree under their names in it.
 
-    A file that is there is replaced at once or not at all.
+    Replaces an existing file completely or not at all.
 
     Args:
         path: file to write.
@@ -40,7 +42,7 @@ def save(path: pathlib.Path, tree: Any) -> pathlib.Path:
 
 
 def load(path: pathlib.Path, like: Tree) -> Tree:
-    """Read arrays into a tree of the same shape.
+    """Read arrays into a tree of a given structure.
 
     Args:
         path: a file that `save` wrote.
@@ -50,8 +52,8 @@ def load(path: pathlib.Path, like: Tree) -> Tree:
         the tree with the file's arrays.
 
     Raises:
-        ValueError: if there is no such file, it is damaged, or its arrays are others
-            than the tree's; names the first.
+        ValueError: if the file is missing, damaged, or differs from the tree in names,
+            shapes or types; names the first array that differs.
 
     Example:
         >>> import tempfile
@@ -83,7 +85,7 @@ def load(path: pathlib.Path, like: Tree) -> Tree:
 
 
 def _named(tree: Any) -> list[tuple[str, Any]]:
-    """The leaves with their names, such as body/down/0/1/kernel/value."""
+    """Return the leaves with their names, such as body/down/0/1/kernel/value."""
     leaves, _ = jax.tree.flatten_with_path(tree)
     return [
         (jax.tree_util.keystr(path, simple=True, separator="/"), leaf)

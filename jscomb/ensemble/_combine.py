@@ -1,15 +1,15 @@
 """From errors to weights, and from weights to the image."""
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.ensemble.errors import SCALES, Bases, check_bases, error_matrix
+from jscomb.ensemble._estimate import SCALES, Bases, check_bases, error_matrix
 from jscomb.numerics import simplex
-from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.typing import Image, Key, Variance
 
@@ -32,7 +32,7 @@ def combine(
     windows: Sequence[int] = SCALES,
     shared: bool = True,
 ) -> Image:
-    """Combine any number of bases by the weights of least estimated error.
+    """Combine any number of bases by the weights of minimum estimated error.
 
     Pure, scale-equivariant, and differentiable in every array with the exact solvers.
     The default is the paper's method; `solver="multi-scale", filter=False` measures
@@ -41,10 +41,10 @@ def combine(
     Args:
         biased: y, each base of the full frame, radiance, shape [N,H,W,C]. The unbiased
             image may be one of them, which makes the result consistent.
-        biased_a: the bases made from half a, likewise.
-        biased_b: the bases made from half b, likewise.
+        biased_a: the bases made from half a, same shape.
+        biased_b: the bases made from half b, same shape.
         unbiased_a: x_a, shape [H,W,C].
-        unbiased_b: x_b, likewise.
+        unbiased_b: x_b, same shape.
         solver: see `solve_weights`.
         filter: smooth the weights by `filter_weights`.
         albedo: guide of the filter, shape [H,W,3]; optional, as is the normal.
@@ -69,17 +69,44 @@ def combine(
 
     Source: ED section 4.
     """
-    halves = biased_a, biased_b, unbiased_a, unbiased_b
+    weights = filtered_weights(
+        biased,
+        biased_a,
+        biased_b,
+        unbiased_a,
+        unbiased_b,
+        solver=solver,
+        filter=filter,
+        albedo=albedo,
+        normal=normal,
+        solver_key=solver_key,
+        windows=windows,
+        shared=shared,
+    )
+    return average(biased, weights)
+
+
+def filtered_weights(
+    biased: Bases,
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    filter: bool,
+    albedo: Guide | None,
+    normal: Guide | None,
+    **options: Any,
+) -> Bases:
+    """The weights of `combine`; options are those of `solve_weights`."""
     if biased.shape != biased_a.shape:
         raise ValueError(f"biased is {biased.shape}, biased_a is {biased_a.shape}")
-    weights = solve_weights(
-        *halves, solver=solver, solver_key=solver_key, windows=windows, shared=shared
-    )
-    if filter:
-        z, z_a, z_b = (average(y, weights) for y in (biased, biased_a, biased_b))
-        noise = jnp.square(z_a - z_b) / 2
-        weights = filter_weights(weights, z, noise, albedo=albedo, normal=normal)
-    return average(biased, weights)
+    weights = solve_weights(biased_a, biased_b, unbiased_a, unbiased_b, **options)
+    if not filter:
+        return weights
+    z, z_a, z_b = (average(y, weights) for y in (biased, biased_a, biased_b))
+    noise = jnp.square(z_a - z_b) / 2
+    return filter_weights(weights, z, noise, albedo=albedo, normal=normal)
 
 
 def solve_weights(
@@ -93,13 +120,13 @@ def solve_weights(
     windows: Sequence[int] = SCALES,
     shared: bool = True,
 ) -> Bases:
-    """Weights of the bases at every pixel.
+    """Solve for the weights of the bases at every pixel.
 
     Args:
         biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
-        biased_b: y^b, likewise of half b.
+        biased_b: y^b, made from half b.
         unbiased_a: x_a, shape [H,W,C].
-        unbiased_b: x_b, likewise.
+        unbiased_b: x_b, same shape.
         solver: "hull", the paper's objective of single pixels and channels, exactly;
             "iterative" and "reference", the same by the paper's solver and by jaxopt;
             "multi-scale", ours: `quadratic` on `error_matrix`.
@@ -108,12 +135,12 @@ def solve_weights(
         shared: of "multi-scale", one weight for all channels.
 
     Returns:
-        the weights, at least zero, of sum one, shape [N,H,W,C]; at a pixel that is not
-        finite in some input 1/N, or those of the pixels around it.
+        the weights, at least zero, of sum one, shape [N,H,W,C]; at an invalid pixel
+        1/N, or those of the pixels around it.
 
     Raises:
-        ValueError: while tracing, if shapes differ, there is no base, the solver is not
-            known, or lacks its key.
+        ValueError: while tracing, if shapes differ, there is no base, the solver is
+            unknown, or lacks its key.
 
     Example:
         >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
@@ -129,8 +156,7 @@ def solve_weights(
         matrix = error_matrix(*images, windows=windows, shared=shared)
         weights = simplex.quadratic(matrix)
         return jnp.broadcast_to(weights, biased_a.shape)
-    valid = finite(unbiased_a, unbiased_b, *biased_a, *biased_b)
-    clean = [jnp.where(valid if i.ndim == 3 else valid[None], i, 0.0) for i in images]
+    _, *clean = zero_invalid(*images)
     if solver == "hull":
         return simplex.hull(*clean)
     if solver == "reference":
@@ -143,14 +169,14 @@ def solve_weights(
 
 
 def one_hot(errors: Bases) -> Bases:
-    """Weights that take the base of least error alone.
+    """Return weights that select the base of minimum error.
 
     Args:
         errors: of each base at each pixel, for example the diagonal of `mse_matrix`,
-            as it is or filtered, shape [N,H,W,C].
+            filtered or not, shape [N,H,W,C].
 
     Returns:
-        1 for the base of least error, the first of equals, else 0, shape [N,H,W,C].
+        1 for the base of minimum error, the first of equals, else 0, shape [N,H,W,C].
 
     Example:
         >>> errors = jnp.array([2.0, 1.0, 3.0]).reshape(3, 1, 1, 1)
@@ -191,8 +217,8 @@ def filter_weights(
         sigma_normal: of the normal.
 
     Returns:
-        the filtered weights, shape [N,H,W,C]; those of pixels that are not finite in
-        some guide are the weights as they were.
+        the filtered weights, shape [N,H,W,C]; unchanged at pixels that are not finite
+        in some guide.
 
     Raises:
         ValueError: while tracing, if shapes differ or `sigma` is not positive.
@@ -228,7 +254,7 @@ def filter_weights(
 
 
 def average(biased: Bases, weights: Bases) -> Image:
-    """The ensemble: the bases' mean with weights.
+    """Average the bases with weights: the ensemble.
 
     Args:
         biased: y, radiance, shape [N,H,W,C].
@@ -245,6 +271,6 @@ def average(biased: Bases, weights: Bases) -> Image:
 
     Source: ED eq. 3.
     """
-    valid = finite(*biased)
-    total = jnp.sum(weights * jnp.where(valid[None], biased, 0.0), axis=0)
+    valid, clean = zero_invalid(biased)
+    total = jnp.sum(weights * clean, axis=0)
     return jnp.where(valid, total, first_finite(*biased))
