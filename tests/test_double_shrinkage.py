@@ -421,7 +421,7 @@ class Pooling(NamedTuple):
     """A network of one parameter, which sees less far than its kernels."""
 
     rate: jax.Array
-    reach = 1
+    reach, multiple = 1, 1
 
     def __call__(self, p, u, b, v, m):
         """Narrower kernels and more confidence where the images differ."""
@@ -466,7 +466,7 @@ def test_a_frame_by_crops(kind, halo, glass_frame):
 
 
 def test_a_network_without_reach(glass_frame):
-    network = jax.tree_util.Partial(lambda *given: Pooling(jnp.float32(1.0))(*given))
+    network = lambda *given: Pooling(jnp.float32(1.0))(*given)
     frame = glass_frame.normalised()
     plan = double_shrinkage.plan_neural(network, frame, smoothed(frame))
     assert plan.halo is None

@@ -28,9 +28,8 @@ def unbiased_error(
 ) -> Image:
     """Estimate the variance of the unbiased image, robust for single pixels.
 
-    A sample variance misses rare bright samples, and the variance of a neighbourhood
-    misses fireflies. The result is the mean of both; the latter is pooled relative to
-    the square of the biased image.
+    A sample variance misses rare bright samples, that of a neighbourhood misses
+    fireflies; the result is the mean of both.
 
     Args:
         unbiased: u, linear radiance, shape [H,W,C].
@@ -126,8 +125,8 @@ def radius_bias(
 
     The bias of density estimation is about proportional to the squared radius. So the
     slope of the passes' images over r^2, times the mean of r^2, is the bias of their
-    mean. The slope is pooled relative to the mean image. With few passes, or radii that
-    hardly differ, it stays noisy, and its square is too large.
+    mean. With few passes, or radii that hardly differ, the pooled slope stays noisy,
+    and its square too large.
 
     Args:
         mean: mean of the passes' images, linear radiance, shape [H,W,C].

@@ -119,8 +119,6 @@ def make_inputs(
         >>> inputs = make_inputs(frame, Estimate(y[0], y), window=3, stride=1)
         >>> print(f"{inputs.mse[0, 0, 0]:.2f} {inputs.variance[0, 0, 0]:.3f}")
         0.04 0.005
-
-    Source: as `combine_frame`.
     """
     frame.require(_NAME, NEEDS)
     if estimate.halves is None:
@@ -194,9 +192,6 @@ def neural_inputs(
         prior, unbiased and biased, [H,W,C]; variance and mse, means over channels,
         [H,W,1].
 
-    Raises:
-        ValueError: as `combine_frame`.
-
     Example:
         >>> from jscomb.frame import make_frame
         >>> x = jnp.ones((2, 4, 4, 3))
@@ -204,8 +199,6 @@ def neural_inputs(
         >>> inputs = neural_inputs(frame, Estimate(x[0], x), window=3, stride=1)
         >>> print({name: image.shape[-1] for name, image in inputs.items()})
         {'prior': 3, 'unbiased': 3, 'biased': 3, 'variance': 1, 'mse': 1}
-
-    Source: DSC section 4, with the prior of the first blend.
     """
     made = make_inputs(frame, estimate, window=window, stride=stride)
     return {
@@ -223,32 +216,25 @@ def plan_neural(
     """Return the network's combination of a frame, to apply whole or by crops.
 
     Args:
-        network: of kernels of 13x13, a pytree. A crop's halo comes from its `reach`,
-            pixels that it sees around a pixel, and crops start at multiples of its
-            `multiple`, if it has them.
+        network: with kernels of 13x13, a pytree; the halo comes from its `reach`, the
+            distance that it sees, and crops start at multiples of its `multiple`.
         frame: normalised, with half buffers.
         estimate: with halves.
         stride: pixels between the centres of the prior's windows.
 
     Returns:
-        `combine_inputs` with the network, and the frame's `neural_inputs`; without halo
-        if the network has no reach.
-
-    Raises:
-        ValueError: as `combine_frame`.
+        `combine_inputs` of the network, and the frame's `neural_inputs`; its halo is
+        None if the network has no reach.
 
     Example:
         >>> import jax
         >>> from jscomb.frame import make_frame
-        >>> x = jnp.ones((2, 4, 4, 3))
-        >>> frame = make_frame(x, variance=x).normalised()
         >>> from jscomb.learning.networks import ShrinkageNetwork
         >>> network = ShrinkageNetwork(jax.random.key(0), size="light")
-        >>> plan = plan_neural(network, frame, Estimate(x[0], x), stride=1)
-        >>> print(plan.whole().shape)
+        >>> x = jnp.ones((2, 4, 4, 3))
+        >>> frame = make_frame(x, variance=x).normalised()
+        >>> print(plan_neural(network, frame, Estimate(x[0], x)).whole().shape)
         (4, 4, 3)
-
-    Source: DSC section 4.3.
     """
     inputs = neural_inputs(frame, estimate, stride=stride)
     return network_plan(combine_inputs, network, inputs, kernel=KERNEL)
@@ -260,17 +246,13 @@ def neural_combine_frame(
     """Combine a frame with an estimate of another integrator by a network.
 
     Args:
-        network: of kernels of 13x13, a pytree, such as
-            `learning.networks.ShrinkageNetwork`.
+        network: as for `plan_neural`, such as `learning.networks.ShrinkageNetwork`.
         frame: normalised, with half buffers.
         estimate: as for `combine_frame`.
         stride: pixels between the centres of the prior's windows.
 
     Returns:
         the combination, as `combine_frame`.
-
-    Raises:
-        ValueError: as `combine_frame`.
 
     Example:
         >>> import jax
