@@ -1,25 +1,14 @@
 """The bases of the ensemble experiments: six real denoisers, each with halves."""
 
-from collections.abc import Callable
+from jscomb.denoisers import bilateral, nonlocal_means, oidn, rdfc, smoothing
+from jscomb.frame import Estimate, Frame, Maker, with_halves
 
-import jax
-
-from jscomb.denoisers import bilateral, nonlocal_means, of_parts, oidn, rdfc, smoothing
-from jscomb.frame import Estimate, Frame
-
-_means = jax.jit(nonlocal_means.denoise)
-_gaussian = jax.jit(smoothing.gaussian)
-
-BASES: dict[str, Callable[[Frame], Estimate]] = {
+BASES: dict[str, Maker] = {
     "oidn": lambda frame: frame.estimates.get("oidn") or oidn.denoise_frame(frame),
     "oidn, no features": lambda frame: oidn.denoise_frame(frame, features=False),
     "bilateral": bilateral.denoise_frame,
-    "gaussian": lambda frame: of_parts(
-        frame, lambda part: _gaussian(part.color), variance=False
-    ),
-    "non-local means": lambda frame: of_parts(
-        frame, lambda part: _means(part.color, part.color, part.variance)
-    ),
+    "gaussian": smoothing.denoise_frame,
+    "non-local means": nonlocal_means.denoise_frame,
     "rdfc": rdfc.denoise_frame,
 }
 
@@ -28,14 +17,15 @@ def bases_of(frame: Frame) -> dict[str, Estimate]:
     """The bases of a frame and of its halves, in the order of `BASES`.
 
     Args:
-        frame: with halves and variances; its own `oidn` is taken if it has one.
+        frame: normalised, with halves and variances; its own `oidn` is taken if it has
+            one.
 
     Returns:
-        the biased images, with halves.
+        the estimates, with halves.
     """
     return {name: make(frame) for name, make in BASES.items()}
 
 
 def unbiased_of(frame: Frame) -> Estimate:
     """The unbiased image as one more base."""
-    return of_parts(frame, lambda part: part.color, variance=False)
+    return with_halves(frame, lambda part: part.color)

@@ -97,7 +97,7 @@ def measured(
     results: pathlib.Path | None = None,
     quick: bool = False,
 ) -> dict[str, dict[str, float]]:
-    """Measure all frames of a folder, each brought to an exposure of one.
+    """Measure all frames of a folder, normalised.
 
     Args:
         folder: of archives.
@@ -121,8 +121,7 @@ def measured(
         missing = {name: kind for name, kind in names.items() if name not in found}
         if not missing:
             continue
-        frame = load(path, samples)
-        frame = frame.scaled(1 / frame.median_luminance)
+        frame = load(path, samples).normalised()
         for name, kind in missing.items():
             found[name] = measures[kind](frame)
             if results is not None:

@@ -4,7 +4,7 @@
 
 Every archive in the folder (see `frames`), at every sample count and with two biased
 images y: Open Image Denoise, and non-local means, a weak one. Relative L2, less the
-reference's noise, at an exposure of 1, of y and of y*; what `worth_regressing` says of
+reference's noise, of normalised frames, of y and y*; what `worth_regressing` says of
 the change, and the reference; and NFOR. Results are kept in the file as they come, and
 what is in it is not measured again.
 """
@@ -15,7 +15,6 @@ import pathlib
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -52,14 +51,13 @@ BASES = ("oidn", "non-local means")
 
 cross = jax.jit(james_stein.cross_regression, static_argnames=("window", "stride"))
 worth = jax.jit(james_stein.worth_regressing, static_argnames=("window", "stride"))
-means = jax.jit(nonlocal_means.denoise)
 
 
 def inputs_of(frame: Frame, base: Estimate) -> tuple[Image, ...]:
     """What `cross_regression` takes: both halves' images, and features that tell.
 
     Args:
-        frame: with halves, at an exposure of 1.
+        frame: normalised, with halves.
         base: a biased image of it with halves.
 
     Returns:
@@ -80,11 +78,7 @@ def base_of(frame: Frame, name: str) -> Estimate:
     """A biased image of the frame and of its halves, by name."""
     if name != "non-local means":
         return frame.estimates[name]
-    full, *halves = (
-        means(part.color, part.color, part.variance)
-        for part in (frame, *frame.halves())
-    )
-    return Estimate(full, jnp.stack(halves))
+    return nonlocal_means.denoise_frame(frame)
 
 
 def measure(frame: Frame, name: str, config: Config) -> Row:

@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from jscomb import choice, ensemble, progressive
+from experiments.rendering import UNTRAINED, of_images
+from jscomb import ensemble, progressive
 from jscomb.denoisers import smoothing
 from jscomb.learning import recipes
 from jscomb.numerics.guards import finite
@@ -72,7 +73,7 @@ def cases(size: int, seed: int) -> dict[str, Case]:
     x, v = truth + deviation * noise, jnp.square(deviation)
     plain = Case(x, 1.05 * truth, v, truth)
     at = (slice(None, None, 17), slice(None, None, 13))
-    scaled = lambda s: Case(s * x, s * plain.estimates, s * s * v, s * truth)
+    scaled = lambda s: Case(s * x, s * plain.biased, s * s * v, s * truth)
     one = lambda h, w: Case(*(image[:h, :w] for image in plain))
     burnt = plain._replace(unbiased=x.at[at].set(1e6), variance=v.at[at].set(1e12))
     return {
@@ -130,7 +131,7 @@ def combiners(*, networks: bool = True) -> dict[str, Combine]:
         return ensemble.combine(bases, bases, bases, x, x, solver="hull", filter=False)
 
     found: dict[str, Combine] = {
-        **choice.UNTRAINED,
+        **{name: of_images(name) for name in UNTRAINED},
         "progressive": lambda x, y, v: progressive.combine(x, y, v, sure(x, y, v)),
         "ensemble": of_bases,
     }

@@ -331,10 +331,20 @@ class Needs(NamedTuple):
     extra: str | None = None
     package: str | None = None
 
-    @property
-    def sub_buffers(self) -> int:
-        """Independent sub-buffers that it needs at least."""
-        return 2 if self.halves else 1
+    def package_of(self) -> dict[str, str | None]:
+        """Return the package alone, to add to other needs by `_replace`."""
+        return {"extra": self.extra, "package": self.package}
+
+    def summary(self) -> str:
+        """Return all needs in a few words; empty if there are none."""
+        some = {
+            "variance": self.variance,
+            "half buffers": self.halves,
+            f"{self.channels} channels": self.channels is not None,
+            ", ".join(self.features): bool(self.features),
+            f"extra `{self.extra}`": self.extra is not None,
+        }
+        return ", ".join(name for name, needed in some.items() if needed)
 
     def missing_package(self) -> str:
         """Return which package is missing and how to install it; empty if none."""
@@ -370,7 +380,7 @@ class Needs(NamedTuple):
         """What a frame, or a half of it, with `k` sub-buffers lacks."""
         total = frame.sub_buffers
         unknown = self.variance and frame.buffers.variance is None
-        wanted = self.sub_buffers * (2 if unknown else 1)
+        wanted = (2 if self.halves else 1) * (2 if unknown else 1)
         channels = frame.buffers.color.shape[-1]
         lacking = [f for f in self.features if getattr(frame.buffers, f) is None]
         if self.normalised and frame.unit is None:
@@ -383,8 +393,8 @@ class Needs(NamedTuple):
             )
         if k < wanted:
             return (
-                f"half buffers: render at least {wanted * total // k} sub-buffers (this "
-                f"frame has {total})"
+                f"half buffers: render at least {wanted * total // k} sub-buffers "
+                f"(this frame has {total})"
             )
         if self.channels not in (None, channels):
             return f"{self.channels} channels of colour, not {channels}"
@@ -429,18 +439,37 @@ def with_halves(
         [0. 3.]
     """
     image = make(frame, *estimates_of(frame, given))
-    fixed = [e for e in _leaves(given) if isinstance(e, Estimate)]
-    if (
-        needs.missing_for_halves(frame)
-        or any(e.halves is None for e in fixed)
-        or (needs.halves and fixed)
-    ):
+    if not halves_possible(frame, given, needs=needs):
         return Estimate(image)
     halves = [
         make(half, *estimates_of(half, given, number))
         for number, half in enumerate(frame.halves())
     ]
     return Estimate(image, jnp.stack(halves))
+
+
+def halves_possible(frame: Frame, given: Any = (), *, needs: Needs) -> bool:
+    """Return whether a combiner can be run on each half of a frame alone.
+
+    Args:
+        frame: the frame.
+        given: estimates of it, makers, or a tree of both.
+        needs: what the combiner needs of a frame; with `needs.halves` an estimate is
+            not enough, because its halves have no halves of their own.
+
+    Returns:
+        whether; `needs.missing_for_halves` is the reason if the frame is in the way.
+
+    Example:
+        >>> frame = make_frame(jnp.ones((2, 2, 2, 1)))
+        >>> print(halves_possible(frame, needs=Needs(halves=True)))
+        False
+    """
+    fixed = [e for e in _leaves(given) if isinstance(e, Estimate)]
+    passed_on = all(e.halves is not None for e in fixed)
+    return passed_on and not (
+        needs.missing_for_halves(frame) or (needs.halves and fixed)
+    )
 
 
 def estimates_of(part: Frame, given: Any, number: int | None = None) -> Any:

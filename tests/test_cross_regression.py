@@ -181,7 +181,9 @@ def textured(noise):
         albedo=albedo,
         reference=albedo,
     )
-    return frame.with_estimate("blurred", Estimate(blurred.mean(0), jnp.asarray(blurred)))
+    return frame.with_estimate(
+        "blurred", Estimate(blurred.mean(0), jnp.asarray(blurred))
+    )
 
 
 def test_regresses_where_features_explain_the_radiance():

@@ -255,7 +255,10 @@ def test_stacked_bases_name_the_one_that_does_not_fit(truth):
         np.testing.assert_array_equal(stack, jnp.stack([image, image]))
     for bases, message in (
         ({}, "at least one base, got none"),
-        ({"one": good, "two": Estimate(truth)}, "base 'two' was not made from each half"),
+        (
+            {"one": good, "two": Estimate(truth)},
+            "base 'two' was not made from each half",
+        ),
         ({"one": good, "two": other}, r"base 'two' has shape .* 'one' has"),
         (
             {"one": good, "two": Estimate(truth, halves[:, 1:])},

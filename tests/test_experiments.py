@@ -21,10 +21,10 @@ from experiments import (
     speed_error,
     uncorrelated,
 )
-from jscomb import exr, metrics
-from jscomb.choice import UNTRAINED
+from experiments.rendering import UNTRAINED
+from jscomb import exr, methods, metrics
 from jscomb.denoisers import oidn
-from jscomb.learning import networks, recipes
+from jscomb.learning import networks
 
 BOX = """<scene version="3.0.0">
   <integrator type="path"/>
@@ -59,7 +59,7 @@ def test_errors_are_those_of_the_metrics(folder, glass_frame):
     ).items()
     assert key == ("glass", 64)
     assert errors.keys() == {"path tracing", "oidn", *UNTRAINED, "auto", "dual"}
-    frame = glass_frame.scaled(1 / glass_frame.median_luminance)
+    frame = glass_frame.normalised()
     r, noise = frame.reference
     expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
     np.testing.assert_allclose(errors["oidn"], expected, rtol=1e-5)
@@ -82,8 +82,7 @@ def test_regression_is_measured(folder, tmp_path):
     assert found.keys() == {f"glass 64 {b}" for b in (*regression_error.BASES, "NFOR")}
     assert regression_error.run(config) == found  # kept, and not measured again
     row = found["glass 64 oidn"]
-    frame = frames.load(folder / "glass.npz", 64)
-    frame = frame.scaled(1 / frame.median_luminance)
+    frame = frames.load(folder / "glass.npz", 64).normalised()
     r, noise = frame.reference
     expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
     np.testing.assert_allclose(row["y"], expected, rtol=1e-6)
@@ -216,9 +215,9 @@ def test_networks_are_measured_beside_the_rest(folder, glass_frame):
     rows = learned.run(learned.Config(folder, quick=True))
     errors = rows["glass", 64]
     assert {"path tracing", "oidn", "whitened", "njs", "dsc", "pd"} <= errors.keys()
-    frame, recipe = glass_frame.normalised(), recipes.RECIPES["dsc"]
-    inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
-    image, (r, noise) = recipe.combine(recipes.shipped("dsc"), inputs), frame.reference
+    frame = glass_frame.normalised()
+    image = methods.combine(jax.random.key(0), frame, method="dsc").image
+    r, noise = frame.reference
     expected = metrics.rel_l2(image, r, half_difference=noise)
     np.testing.assert_allclose(errors["dsc"], expected, rtol=1e-3)
     table = learned.summary(rows)

@@ -167,7 +167,7 @@ def test_njs_file(tmp_path):
 def test_blender_layers(tmp_path):
     """Cycles with denoising data, of a denoised render with the compositor's output."""
     depth = 9 * noise(4, H, W, 1)
-    depth[0] = 1e10  # nothing there
+    depth[0] = 1e10  # background
     rgba = lambda seed: noise(seed, H, W, 4)
     channels = {
         **layer("Composite.Combined", rgba(0), "RGBA"),
@@ -180,8 +180,8 @@ def test_blender_layers(tmp_path):
         **layer("View Layer.Denoising Shadowing", noise(7, H, W, 1), "X"),
         **layer("Z second.Combined", rgba(8), "RGBA"),
     }
-    said = {"cycles.View Layer.samples": "128", "cycles.Z second.samples": "1"}
-    frame = exr.read_frame(write(tmp_path / "b.exr", channels, **said))
+    attributes = {"cycles.View Layer.samples": "128", "cycles.Z second.samples": "1"}
+    frame = exr.read_frame(write(tmp_path / "b.exr", channels, **attributes))
     assert frame.samples == 128
     np.testing.assert_array_equal(frame.color, rgba(2)[..., :3])
     np.testing.assert_array_equal(frame.estimates["denoised"].image, rgba(1)[..., :3])

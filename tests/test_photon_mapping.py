@@ -106,7 +106,9 @@ def test_a_frame_with_photons(config):
     frame = photon_mapping.run(config)
     read = exr.read_frame(config.out)
     photons = read.estimates[photon_mapping.PHOTONS]
-    np.testing.assert_allclose(photons.image, np.mean(photons.halves, axis=0), rtol=1e-5)
+    np.testing.assert_allclose(
+        photons.image, np.mean(photons.halves, axis=0), rtol=1e-5
+    )
     assert photons.halves.shape == (2, SIZE, SIZE, 3)
     assert not np.array_equal(*photons.halves)
     np.testing.assert_array_equal(photons.image, frame.estimates["photons"].image)

@@ -1,18 +1,16 @@
-"""Open Image Denoise, guarded: exposure, invalid pixels, halves.
+"""Open Image Denoise, with guards: normalisation, invalid pixels, halves.
 
-The filter is not scale-equivariant at very low radiance, one infinite pixel spreads
-far, and NaN counts as black. So the image is brought to an exposure of one first (and
-back after), and each pixel that is not finite is filled from its neighbours before the
-filter sees it. Images [H,W,3], linear radiance.
+The filter is not scale-equivariant at very low radiance, one infinite pixel corrupts a
+large area, and NaN counts as black. So images are normalised to a median luminance of
+one, and each invalid pixel is filled from its neighbours before the filter sees it.
+Images [H,W,3], linear radiance.
 
-A function for `jit`, `vmap` (one image after the other) and forward derivatives: the
-filter itself runs on the host, and its derivative is a central difference. It has no
-reverse derivative.
+For `jit`, `vmap` (one image after the other) and forward derivatives: the filter itself
+runs on the host, and its derivative is a central difference. It has no reverse
+derivative.
 
 Needs the extra `oidn` (`pip install "jscomb[oidn]"`).
 """
-
-import importlib.util
 
 import jax
 import jax.numpy as jnp
@@ -24,25 +22,34 @@ from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.guards import finite
 from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.windows import window_max, window_mean
+from jscomb.typing import Image
+
+__all__ = [
+    "NEEDS",
+    "available",
+    "denoise",
+    "denoise_color",
+    "denoise_frame",
+    "denoise_normalised",
+]
+
+NEEDS = Needs(channels=3, normalised=True, extra="oidn", package="pyoidn")
 
 _LARGEST = 1e5  # normalised radiance; beyond, the filter's half floats overflow
 _STEP = 0.03  # of a difference, relative to the typical pixel
 
 
 def available() -> bool:
-    """Whether Open Image Denoise is installed.
+    """Return whether Open Image Denoise is installed.
 
     Returns:
         True if `denoise` can run.
 
     Example:
         >>> from jscomb import denoisers
-        >>> maker = denoisers.oidn if available() else denoisers.bilateral
+        >>> denoiser = denoisers.oidn if available() else denoisers.bilateral
     """
-    return importlib.util.find_spec("pyoidn") is not None
-
-
-NEEDS = Needs(channels=3, normalised=True, extra="oidn", package="pyoidn")
+    return not NEEDS.missing_package()
 
 
 def denoise(
@@ -54,7 +61,7 @@ def denoise(
     """Denoise one image.
 
     Args:
-        color: linear radiance, shape [H,W,3]; may hold pixels that are not finite.
+        color: linear radiance, shape [H,W,3]; may hold invalid pixels.
         albedo: shape [H,W,3], clipped to [0, 1] here; optional.
         normal: shape [H,W,3], components in [-1, 1]; optional, needs `albedo`.
 
@@ -82,13 +89,13 @@ def denoise_normalised(
     albedo: ArrayLike | None = None,
     normal: ArrayLike | None = None,
 ) -> Array:
-    """Denoise one image of a median luminance of one.
+    """Denoise one normalised image.
 
-    Unlike `denoise` it does not normalise, so the unit does not follow the noise: for
-    derivatives, and for halves or crops of a normalised frame.
+    For halves and crops of a normalised frame, and for derivatives: those of `denoise`
+    include its unit's, which follows the noise.
 
     Args:
-        color: normalised radiance, shape [H,W,3]; may hold pixels that are not finite.
+        color: normalised radiance, shape [H,W,3]; may hold invalid pixels.
         albedo: shape [H,W,3], clipped to [0, 1] here; optional.
         normal: shape [H,W,3], components in [-1, 1]; optional, needs `albedo`.
 
@@ -118,65 +125,47 @@ def denoise_normalised(
     return _filter(jnp.clip(_fill(image), 0.0, _LARGEST), features)
 
 
-def _checked(color: ArrayLike) -> Array:
-    """The image in float32, if the filter can denoise it."""
-    if missing := NEEDS.missing_package():
-        raise ImportError(f"Open Image Denoise needs {missing}")
-    image = jnp.asarray(color, jnp.float32)
-    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise ValueError(f"color must have shape [H,W,3], got {image.shape}")
-    return image
+def denoise_color(color: Image, frame: Frame, *, features: bool = True) -> Image:
+    """Denoise another colour of a normalised frame, guided by the frame's features.
 
+    For derivatives with respect to the colour, as `progressive` takes them.
 
-@jax.custom_jvp
-def _filter(color: Array, features: dict[str, Array]) -> Array:
-    """The filter on the host, [H,W,3]."""
-    shape = jax.ShapeDtypeStruct(color.shape, jnp.float32)
-    return jax.pure_callback(_on_host, shape, color, features, vmap_method="sequential")
+    Args:
+        color: normalised radiance, shape [H,W,3].
+        frame: normalised, of the same size.
+        features: use the frame's albedo and normal.
 
+    Returns:
+        the denoised colour, normalised radiance, float32, shape [H,W,3].
 
-def _on_host(color: ArrayLike, features: dict[str, ArrayLike]) -> np.ndarray:
-    """The filter on NumPy arrays."""
-    import pyoidn
+    Raises:
+        ImportError: if Open Image Denoise is not installed.
+        ValueError: if the frame is not normalised or does not have three channels.
+        RuntimeError: if the filter reports a failure.
 
-    guides = {name: np.asarray(feature) for name, feature in features.items()}
-    result = pyoidn.denoise(
-        np.asarray(color), guides.get("albedo"), guides.get("normal"), hdr=True
-    )
-    return np.asarray(result, np.float32)
-
-
-@_filter.defjvp
-def _filter_jvp(
-    primals: tuple[Array, dict[str, Array]], tangents: tuple[Array, dict[str, Array]]
-) -> tuple[Array, Array]:
-    """Central difference; its step moves the typical pixel by `_STEP` of its value.
-
-    The typical one (geometric mean) of those that move at all: with the largest as
-    measure the steps of all others would be lost to rounding beside a firefly.
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> noise = jax.random.exponential(jax.random.key(0), (32, 32, 3), jnp.float32)
+        >>> frame = make_frame(noise).normalised()
+        >>> if available():
+        ...     made = denoise_color(frame.color, frame)
+        ...     assert (made == denoise_frame(frame).image).all()
     """
-    size = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(primals)])
-    speed = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(tangents)])
-    moves = speed > 0
-    relative = jnp.log(jnp.where(moves, speed, 1.0) / (size + 1))
-    count = jnp.maximum(jnp.sum(moves), 1).astype(relative.dtype)
-    step = _STEP * jnp.exp(-jnp.sum(jnp.where(moves, relative, 0.0)) / count)
-    at = lambda side: _filter(
-        *jax.tree.map(lambda p, t: p + side * step * t, primals, tangents)
-    )
-    return _filter(*primals), (at(1.0) - at(-1.0)) / (2 * step)
+    frame.require("oidn", NEEDS)
+    albedo = frame.albedo if features else None
+    normal = None if albedo is None else frame.normal
+    return denoise_normalised(color, albedo=albedo, normal=normal)
 
 
 def denoise_frame(frame: Frame, *, features: bool = True) -> Estimate:
-    """Denoise a normalised frame, and each of its halves by itself.
+    """Denoise a normalised frame, guided by its albedo and normal.
 
     Args:
-        frame: normalised, with colour of three channels; its albedo and normal guide
-            the filter.
-        features: use them.
+        frame: normalised, with three channels.
+        features: use its albedo, and its normal if it has both.
 
     Returns:
-        the denoised frame, normalised radiance.
+        the estimate, normalised radiance.
 
     Raises:
         ImportError: if Open Image Denoise is not installed.
@@ -192,17 +181,61 @@ def denoise_frame(frame: Frame, *, features: bool = True) -> Estimate:
         ...     assert made.image.std() < made.halves.std() < 0.1 * noise.std()
     """
     frame.require("oidn", NEEDS)
-
-    def one(part: Frame) -> Array:
-        albedo = part.albedo if features else None
-        normal = None if albedo is None else part.normal
-        return denoise_normalised(part.color, albedo=albedo, normal=normal)
-
+    one = lambda part: denoise_color(part.color, part, features=features)
     return with_halves(frame, one, needs=NEEDS)
 
 
+def _checked(color: ArrayLike) -> Array:
+    """Return the image in float32, if the filter can denoise it."""
+    if missing := NEEDS.missing_package():
+        raise ImportError(f"Open Image Denoise needs {missing}")
+    image = jnp.asarray(color, jnp.float32)
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise ValueError(f"color must have shape [H,W,3], got {image.shape}")
+    return image
+
+
+@jax.custom_jvp
+def _filter(color: Array, features: dict[str, Array]) -> Array:
+    """Filter on the host, [H,W,3]."""
+    shape = jax.ShapeDtypeStruct(color.shape, jnp.float32)
+    return jax.pure_callback(_on_host, shape, color, features, vmap_method="sequential")
+
+
+def _on_host(color: ArrayLike, features: dict[str, ArrayLike]) -> np.ndarray:
+    """Filter NumPy arrays."""
+    import pyoidn
+
+    guides = {name: np.asarray(feature) for name, feature in features.items()}
+    result = pyoidn.denoise(
+        np.asarray(color), guides.get("albedo"), guides.get("normal"), hdr=True
+    )
+    return np.asarray(result, np.float32)
+
+
+@_filter.defjvp
+def _filter_jvp(
+    primals: tuple[Array, dict[str, Array]], tangents: tuple[Array, dict[str, Array]]
+) -> tuple[Array, Array]:
+    """Central difference; its step changes the typical pixel by `_STEP` of its value.
+
+    Typical is the geometric mean of those that change at all: if the largest decided,
+    the steps of all others would be lost to rounding beside a firefly.
+    """
+    size = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(primals)])
+    speed = jnp.concatenate([abs(i).ravel() for i in jax.tree.leaves(tangents)])
+    moves = speed > 0
+    relative = jnp.log(jnp.where(moves, speed, 1.0) / (size + 1))
+    count = jnp.maximum(jnp.sum(moves), 1).astype(relative.dtype)
+    step = _STEP * jnp.exp(-jnp.sum(jnp.where(moves, relative, 0.0)) / count)
+    at = lambda side: _filter(
+        *jax.tree.map(lambda p, t: p + side * step * t, primals, tangents)
+    )
+    return _filter(*primals), (at(1.0) - at(-1.0)) / (2 * step)
+
+
 def _fill(image: Array) -> Array:
-    """Pixels that are not finite become the mean of finite neighbours, ring by ring."""
+    """Set invalid pixels to the mean of valid neighbours, ring by ring."""
     valid = finite(image)
 
     def ring(state: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -1,5 +1,6 @@
 """Large images in parts: cut, worked on, and put together again."""
 
+from jscomb.numerics.tiles._plans import network_plan as network_plan
 from jscomb.numerics.tiles.crops import Crop as Crop
 from jscomb.numerics.tiles.crops import Local as Local
 from jscomb.numerics.tiles.crops import crops as crops
