@@ -290,7 +290,9 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
                 axis=-1,
             )
         ),
-        "smoothing.gaussian": Entry(lambda r: smoothing.gaussian(r.unbiased), 8),
+        "smoothing.gaussian": Entry(
+            lambda r: smoothing.gaussian(r.unbiased), smoothing.reach()
+        ),
         "smoothing.box": Entry(lambda r: smoothing.box(r.unbiased), 3),
         "kernel_predicting.denoise_normalised": Entry(
             _normalised(

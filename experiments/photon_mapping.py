@@ -34,7 +34,7 @@ import tyro
 from experiments import render, scenes
 from jscomb.frame import Estimate, Frame
 
-PHOTONS = "photons"  # the biased image's name
+PHOTONS = "photons"  # the estimate's name
 ALPHA = 2 / 3
 ROOM = 8  # meetings that are stored, times the photons; doubled where it is short
 RADIUS = 0.01  # of the first passes, times the diagonal of the scene

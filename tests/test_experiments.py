@@ -24,7 +24,7 @@ from experiments import (
 from experiments.rendering import UNTRAINED
 from jscomb import exr, methods, metrics
 from jscomb.denoisers import oidn
-from jscomb.learning import networks
+from jscomb.learning import networks, recipes
 
 BOX = """<scene version="3.0.0">
   <integrator type="path"/>
@@ -215,9 +215,9 @@ def test_networks_are_measured_beside_the_rest(folder, glass_frame):
     rows = learned.run(learned.Config(folder, quick=True))
     errors = rows["glass", 64]
     assert {"path tracing", "oidn", "whitened", "njs", "dsc", "pd"} <= errors.keys()
-    frame = glass_frame.normalised()
-    image = methods.combine(jax.random.key(0), frame, method="dsc").image
-    r, noise = frame.reference
+    frame, recipe = glass_frame.normalised(), recipes.RECIPES["dsc"]
+    inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
+    image, (r, noise) = recipe.combine(recipes.shipped("dsc"), inputs), frame.reference
     expected = metrics.rel_l2(image, r, half_difference=noise)
     np.testing.assert_allclose(errors["dsc"], expected, rtol=1e-3)
     table = learned.summary(rows)

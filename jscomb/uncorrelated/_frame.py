@@ -85,7 +85,7 @@ def select_gamma_frame(
         >>> y, z = rng.normal(1, 0.2, (2, 4, 8, 8, 1))
         >>> y, z = (make_frame(i, samples=64).normalised(1.0) for i in (y, z))
         >>> print(f"{select_gamma_frame(y, z, window=5):.2f}")
-        2.50
+        0.50
 
     Source: IDU section 4.2.
     """
