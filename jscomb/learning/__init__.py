@@ -11,4 +11,4 @@ slow, so modules are imported by name::
     image = recipe.combine(network, inputs)
 """
 
-__all__ = ["checkpoints", "losses", "networks", "recipes", "training"]
+__all__ = ["checkpoints", "losses", "networks", "recipes", "training"]  # pyright: ignore

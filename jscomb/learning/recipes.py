@@ -72,9 +72,14 @@ def exchanged(inputs: MakeInputs) -> MakeInputs:
         the function with x and y, and v and s, exchanged.
 
     Example:
-        >>> images = {"unbiased": 1, "biased": 2, "variance": 3, "sure": 4}
-        >>> print(exchanged(lambda *_: images)(None, None, None))
-        {'unbiased': 2, 'biased': 1, 'variance': 4, 'sure': 3}
+        >>> import jax.numpy as jnp
+        >>> from jscomb.frame import make_frame
+        >>> names, one = ("unbiased", "biased", "variance", "sure"), jnp.ones((1, 1, 1))
+        >>> images = {name: k * one for k, name in enumerate(names)}
+        >>> other = exchanged(lambda key, frame, estimate: images)
+        >>> inputs = other(jax.random.key(0), make_frame(one), Estimate(one))
+        >>> print({name: image.item() for name, image in inputs.items()})
+        {'unbiased': 1.0, 'biased': 0.0, 'variance': 3.0, 'sure': 2.0}
     """
 
     def other(key: Key, frame: Frame, estimate: Estimate) -> Inputs:

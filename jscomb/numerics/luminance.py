@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jscomb.numerics.guards import divide
 from jscomb.numerics.medians import median
 from jscomb.typing import Image, Scalar
 
@@ -58,5 +59,13 @@ def at_unit_luminance(
     unit = median_luminance(images[0])
     # Divided twice: the unit's square may leave the range of float32.
     return unit * function(
-        *(i / unit for i in images), *(s / unit / unit for s in squares)
+        *(_divided(i, unit) for i in images),
+        *(_divided(_divided(s, unit), unit) for s in squares),
     )
+
+
+def _divided(image: Array, unit: Scalar) -> Array:
+    """Divide where an image is finite; elsewhere the unit would have no derivative."""
+    known = jnp.isfinite(image)
+    units = jnp.broadcast_to(unit, image.shape)
+    return divide(image, units, where=known, otherwise=image)
