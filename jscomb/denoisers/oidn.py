@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import ArrayLike
 
-from jscomb.frame import Estimate, Frame, Needs, with_halves
+from jscomb.frame import Estimate, Frame, Needs, Package, with_halves
 from jscomb.numerics.guards import finite
 from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.windows import window_max, window_mean
@@ -33,7 +33,7 @@ __all__ = [
     "denoise_normalised",
 ]
 
-NEEDS = Needs(channels=3, normalised=True, extra="oidn", package="pyoidn")
+NEEDS = Needs(channels=3, normalised=True, package=Package("pyoidn", "oidn"))
 
 _LARGEST = 1e5  # normalised radiance; beyond, the filter's half floats overflow
 _STEP = 0.03  # of a difference, relative to the typical pixel
