@@ -22,7 +22,7 @@ from experiments import (
     uncorrelated,
 )
 from experiments.rendering import UNTRAINED
-from jscomb import exr, methods, metrics
+from jscomb import exr, metrics
 from jscomb.denoisers import oidn
 from jscomb.learning import networks, recipes
 
