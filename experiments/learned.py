@@ -90,9 +90,9 @@ def measure_untrained(frame: Frame) -> dict[str, float]:
 
 def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
     """Return NJS's inputs with the regressed image, then those with the plain one."""
-    estimate, key = frame.estimates["oidn"], jax.random.key(0)
+    estimate = frame.estimates["oidn"]
     both = [
-        james_stein.neural_inputs(key, frame, estimate, choose=choose)
+        james_stein.neural_inputs(jax.random.key(0), frame, estimate, choose=choose)
         for choose in ("helps", "opposite")
     ]
     plain = lambda inputs: bool(jnp.all(inputs["biased_a"] == inputs["biased_b"]))

@@ -119,9 +119,9 @@ def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
             continue  # the camera sees no light
         frame = frame.normalised()
         assert frame.reference is not None
-        key, estimate = jax.random.key(number), frame.estimates["oidn"]
+        estimate = frame.estimates["oidn"]
         makers = filter(None, (ALL[method].inputs, ALL[method].other))
-        variants = [make(key, frame, estimate) for make in makers]
+        variants = [make(jax.random.key(number), frame, estimate) for make in makers]
         inputs.append(
             {name: np.stack([v[name] for v in variants]) for name in variants[0]}
         )
