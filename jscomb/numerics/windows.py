@@ -279,26 +279,6 @@ def check_window(window: int) -> int:
     return window
 
 
-def reach_of(*windows: int) -> int:
-    """Return how far a chain of windows sees.
-
-    Args:
-        windows: widths w in pixels, odd; each is applied to the result of the one
-            before.
-
-    Returns:
-        the sum of w // 2, in pixels.
-
-    Raises:
-        ValueError: if a width is even or less than one.
-
-    Example:
-        >>> reach_of(21, 7)
-        13
-    """
-    return sum(check_window(window) // 2 for window in windows)
-
-
 def _only(image: Image, mask: Mask | None, neutral: float) -> Image:
     """Return the image with `neutral` at excluded pixels."""
     return image if mask is None else jnp.where(mask, image, neutral)
