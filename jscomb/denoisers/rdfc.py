@@ -138,6 +138,7 @@ def plan_frame(frame: Frame, *, window: int = 21) -> Local:
         the function, its images and how far it sees.
 
     Example:
+        >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> one = jnp.ones((2, 4, 4, 1))
         >>> print(plan_frame(make_frame(one, variance=one)).halo)
