@@ -16,12 +16,13 @@ def _no_sure(key, frame, estimate):
 
 def _quotient(network, inputs, **options):
     """Combine as PD's paper does: alpha in the form of its equation 9, and bounded."""
-    return progressive.neural_combine_normalised(network, **inputs, **options)
+    options = {"activate": progressive.activation, "bound": True} | options
+    return progressive.combine_inputs(network, inputs, **options)
 
 
 def _equal(network, inputs):
     """Combine as NJS's paper does: one variance a window, of 15x15."""
-    return james_stein.neural_combine_normalised(network, **inputs)
+    return james_stein.combine_inputs(network, inputs, window=15, whiten=False)
 
 
 # The bound needs an unbiased x, which half of the inputs drawn in training do not have.

@@ -175,13 +175,19 @@ def combiners() -> dict[str, Entry]:
             lambda r: james_stein.combine_dual(*halves(r), r.variance),
             james_stein.reach(),
         ),
-        "james_stein.neural_combine_normalised": Entry(
+        "james_stein.combine_inputs": Entry(
             _normalised(
-                lambda r: james_stein.neural_combine_normalised(
-                    njs, r.unbiased, *halves(r)[2:], r.variance
+                lambda r: james_stein.combine_inputs(
+                    njs,
+                    {
+                        "unbiased": r.unbiased,
+                        "biased_a": r.biased_a,
+                        "biased_b": r.biased_b,
+                        "variance": r.variance,
+                    },
                 )
             ),
-            max(njs.reach, 7) + james_stein.reach(15),
+            max(njs.reach, 7) + james_stein.reach(7),
             multiple=njs.multiple,
         ),
         "ensemble.combine": Entry(_ensemble, rounding=1e-4),
@@ -204,20 +210,33 @@ def combiners() -> dict[str, Entry]:
             ),
             1,
         ),
-        "double_shrinkage.neural_combine_normalised": Entry(
+        "double_shrinkage.combine_inputs": Entry(
             _normalised(
-                lambda r: double_shrinkage.neural_combine_normalised(
-                    dsc, prior(r), *xyv(r)[:2], r.grey, r.grey / 4
+                lambda r: double_shrinkage.combine_inputs(
+                    dsc,
+                    {
+                        "prior": prior(r),
+                        "unbiased": r.unbiased,
+                        "biased": r.biased,
+                        "variance": r.grey,
+                        "mse": r.grey / 4,
+                    },
                 )
             ),
             max(dsc.reach, 6) + 1,
             multiple=dsc.multiple,
         ),
         "progressive.combine": Entry(lambda r: progressive.combine(*xyv(r), risk(r))),
-        "progressive.neural_combine_normalised": Entry(
+        "progressive.combine_inputs": Entry(
             _normalised(
-                lambda r: progressive.neural_combine_normalised(
-                    pd, *xyv(r), risk(r), bound=False
+                lambda r: progressive.combine_inputs(
+                    pd,
+                    {
+                        "unbiased": r.unbiased,
+                        "biased": r.biased,
+                        "variance": r.variance,
+                        "sure": risk(r),
+                    },
                 )
             ),
             pd.reach,
@@ -227,7 +246,10 @@ def combiners() -> dict[str, Entry]:
                 lambda r, method=method: _plan(r, method).whole(), _reach(method)
             )
             for name, method in METHODS.items()
-            if method.pure and name != "denoised"  # which returns its input
+            # `denoised` returns its input; denoisers have entries of their own.
+            if method.pure
+            and method.takes == "one estimate"
+            and name != "denoised"
         },
     }
 

@@ -120,12 +120,14 @@ def measure_network(
         regressed, plain = map(combine, _james_stein_inputs(frame))
         images |= {", always regressed": regressed, ", never regressed": plain}
     if method.startswith("pd"):
-        direct = progressive.direct_activation if method == "pd" else None
+        direct = (
+            progressive.direct_activation if method == "pd" else progressive.activation
+        )
         for name, bound in ((", bound", True), (", no bound", False)):
             variant = functools.partial(
-                progressive.neural_combine_normalised, activate=direct, bound=bound
+                progressive.combine_inputs, activate=direct, bound=bound
             )
-            images[name] = jax.jit(variant)(network, **inputs)
+            images[name] = jax.jit(variant)(network, inputs)
     if method == "kernels-njs":
         images[", its denoiser"] = RECIPES["kernels"].combine(network.denoiser, inputs)
     return _errors(images, frame)

@@ -40,7 +40,7 @@ from jscomb.typing import Image, Scalar, Variance
 
 __all__ = ["NEEDS", "denoise", "denoise_frame", "filter_features"]
 
-NEEDS = Needs(variance=True, halves=True)
+NEEDS = Needs(variance=True, halves=True, variance_of_halves=True)
 
 Features = Float[Array, "h w f"]
 Pair = Float[Array, "2 h w c"]  # of the halves, or of the strengths

@@ -49,11 +49,14 @@ def with_halves(
     image = make(frame, *estimates_of(frame, given))
     if not halves_possible(frame, given, needs=needs):
         return Estimate(image)
-    halves = [
-        make(half, *estimates_of(half, given, number))
+    parts = [
+        (half, estimates_of(half, given, number))
         for number, half in enumerate(frame.halves())
     ]
-    return Estimate(image, jnp.stack(halves))
+    made = _leaves([own for _, own in parts])
+    if needs.halves and any(estimate.halves is None for estimate in made):
+        return Estimate(image)  # a maker could not make them of a half
+    return Estimate(image, jnp.stack([make(half, *own) for half, own in parts]))
 
 
 def halves_possible(frame: Frame, given: Any = (), *, needs: Needs) -> bool:

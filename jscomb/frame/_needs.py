@@ -22,8 +22,10 @@ class Needs(NamedTuple):
     """What a denoiser or combiner needs of a frame.
 
     Attributes:
-        variance: variances, or sub-buffers to estimate them from.
-        halves: half buffers, and the variances of each if it needs variances.
+        variance: the variance, or sub-buffers to estimate it from.
+        halves: half buffers.
+        variance_of_halves: the variance of each half, or sub-buffers to estimate it
+            from.
         channels: of the colour; None for any number.
         features: names of features, such as albedo.
         normalised: radiance divided by the median luminance.
@@ -32,6 +34,7 @@ class Needs(NamedTuple):
 
     variance: bool = False
     halves: bool = False
+    variance_of_halves: bool = False
     channels: int | None = None
     features: tuple[str, ...] = ()
     normalised: bool = False
@@ -82,18 +85,19 @@ class Needs(NamedTuple):
         if self.normalised and frame.unit is None:
             return "a normalised frame: call frame.normalised(), or use jscomb.combine"
         has, channels = frame.sub_buffers, frame.buffers.color.shape[-1]
-        estimated = self.variance and frame.buffers.variance is None
-        wanted = parts * (2 if self.halves else 1) * (2 if estimated else 1)
+        unknown = frame.buffers.variance is None
+        estimates = (self.variance or self.variance_of_halves) and unknown
+        halves = self.halves or self.variance_of_halves
+        wanted = parts * (2 if estimates or halves else 1)
+        if self.variance_of_halves and unknown:
+            wanted *= 2
         lacking = [f for f in self.features if getattr(frame.buffers, f) is None]
-        if has < wanted and (self.halves or not estimated):
-            return (
-                f"half buffers: render at least {wanted} sub-buffers (this frame has "
-                f"{has})"
-            )
         if has < wanted:
+            what = "half buffers" if halves or not estimates else "the variance"
+            also = " with variances, or" if estimates else ""
             return (
-                "the variance, given or estimated from sub-buffers: render with "
-                f"variances, or at least {wanted} sub-buffers (this frame has {has})"
+                f"{what}: render{also} at least {wanted} sub-buffers (this frame has "
+                f"{has})"
             )
         if self.channels not in (None, channels):
             return f"{self.channels} channels of colour, not {channels}"

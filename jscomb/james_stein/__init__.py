@@ -51,7 +51,6 @@ from jscomb.james_stein._frame import (
     NEURAL_NEEDS,
     Regressed,
     combine_frame,
-    combine_inputs,
     neural_combine_frame,
     neural_inputs,
     plan_frame,
@@ -60,8 +59,8 @@ from jscomb.james_stein._frame import (
 )
 from jscomb.james_stein._neural import (
     Parameters,
+    combine_inputs,
     neural_combine,
-    neural_combine_normalised,
 )
 from jscomb.james_stein._regression import cross_regression
 from jscomb.numerics.variances import robust_variance, smooth_variance
@@ -79,7 +78,6 @@ __all__ = [
     "guide_noise",
     "neural_combine",
     "neural_combine_frame",
-    "neural_combine_normalised",
     "neural_inputs",
     "plan_frame",
     "plan_neural",

@@ -1,7 +1,6 @@
 """The James-Stein combiner on frames, without and with its network."""
 
 import functools
-from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import jax
@@ -12,7 +11,7 @@ from jscomb.features import select, stack
 from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
 from jscomb.james_stein._combine import combine, reach
 from jscomb.james_stein._estimate import COARSE, worth_regressing
-from jscomb.james_stein._neural import Network, neural_combine_normalised
+from jscomb.james_stein._neural import KERNEL, Network, combine_inputs
 from jscomb.james_stein._regression import RIDGE, cross_regression
 from jscomb.metrics import Change
 from jscomb.numerics.tiles import Local, compiled, network_plan
@@ -22,7 +21,6 @@ from jscomb.typing import Image, Key, Variance
 
 NEEDS = Needs(variance=True)
 NEURAL_NEEDS = Needs(variance=True, channels=3, normalised=True)
-_NEURAL_WINDOW, _KERNEL_WINDOW = 7, 15
 
 
 def combine_frame(
@@ -267,8 +265,8 @@ def plan_neural(
         combine_inputs,
         network,
         inputs,
-        kernel=_KERNEL_WINDOW,
-        around=reach(_NEURAL_WINDOW),
+        kernel=KERNEL,
+        around=reach(7),
     )
 
 
@@ -318,32 +316,3 @@ def neural_inputs(
         "biased_b": b,
         "variance": frame.variance,
     }
-
-
-def combine_inputs(network: Network, inputs: Mapping[str, Image]) -> Image:
-    """Combine what `neural_inputs` returns, whitened in windows of 7x7.
-
-    Args:
-        network: as in `neural_combine`.
-        inputs: as `neural_inputs` returns them.
-
-    Returns:
-        the combination, normalised radiance, shape [H,W,C].
-
-    Example:
-        >>> from jscomb.james_stein import Parameters
-        >>> from jscomb.numerics.kernels import Kernels
-        >>> x, y = jnp.full((4, 4, 1), 3.0), jnp.ones((4, 4, 1))
-        >>> even = Kernels(x, lambda near: jnp.ones((*near.shape[:2], 15**2)), 0)
-        >>> network = lambda *_: Parameters(even, 0.5 * y)
-        >>> inputs = {"unbiased": x, "biased_a": y, "biased_b": y, "variance": y}
-        >>> print(combine_inputs(network, inputs)[0, 0].round(3))
-        [2.562]
-    """
-    return neural_combine_normalised(
-        network,
-        **inputs,
-        window=_NEURAL_WINDOW,
-        kernel_window=_KERNEL_WINDOW,
-        whiten=True,
-    )

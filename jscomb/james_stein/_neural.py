@@ -1,7 +1,6 @@
 """James-Stein combination with a network's variances."""
 
-import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,6 +11,8 @@ from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
 from jscomb.numerics.kernels import Kernels, predicted_mean
 from jscomb.numerics.luminance import at_unit_luminance
 from jscomb.typing import Image, Variance
+
+KERNEL = 15  # width in pixels
 
 
 class Parameters(NamedTuple):
@@ -37,7 +38,7 @@ def neural_combine(
     variance: Variance,
     *,
     window: int = 15,
-    kernel_window: int = 15,
+    kernel_window: int = KERNEL,
     whiten: bool = False,
 ) -> Image:
     """Shrink towards the regressed image by the variance that a network estimates.
@@ -80,38 +81,33 @@ def neural_combine(
     check_same_shape(
         unbiased=unbiased, biased_a=biased_a, biased_b=biased_b, variance=variance
     )
-    combine_normalised = functools.partial(
-        neural_combine_normalised,
+    names = "unbiased", "biased_a", "biased_b", "variance"
+    normalised = lambda *images: combine_inputs(
         network,
+        dict(zip(names, images, strict=True)),
         window=window,
         kernel_window=kernel_window,
         whiten=whiten,
     )
     images = unbiased, biased_a, biased_b
-    return at_unit_luminance(combine_normalised, *images, squares=[variance])
+    return at_unit_luminance(normalised, *images, squares=[variance])
 
 
-def neural_combine_normalised(
+def combine_inputs(
     network: Network,
-    unbiased: Image,
-    biased_a: Image,
-    biased_b: Image,
-    variance: Variance,
+    inputs: Mapping[str, Image],
     *,
-    window: int = 15,
-    kernel_window: int = 15,
-    whiten: bool = False,
+    window: int = 7,
+    kernel_window: int = KERNEL,
+    whiten: bool = True,
 ) -> Image:
-    """Shrink normalised images; for crops of a normalised frame, and for training.
+    """Combine normalised images by name, for crops of a frame and for training.
 
     Local, and not scale-equivariant: `neural_combine` without its normalisation.
 
     Args:
         network: as for `neural_combine`.
-        unbiased: x, normalised radiance, shape [H,W,C].
-        biased_a: y^_a, likewise.
-        biased_b: y^_b, likewise.
-        variance: of the mean x, at least zero, likewise.
+        inputs: unbiased, biased_a, biased_b and variance, as `neural_inputs` makes.
         window: width of the windows that are shrunk, in pixels, odd, at least three.
         kernel_window: width of the network's kernels in pixels, odd.
         whiten: allow each pixel its own variance within a window.
@@ -127,16 +123,17 @@ def neural_combine_normalised(
         >>> x, y = jnp.full((4, 4, 1), 3.0), jnp.ones((4, 4, 1))
         >>> even = Kernels(x, lambda near: jnp.ones((*near.shape[:2], 15**2)), 0)
         >>> network = lambda *_: Parameters(even, 0.5 * y)
-        >>> z = neural_combine_normalised(network, x, y, y, y, window=3)
-        >>> print(z[0, 0].round(3))
-        [2.674]
+        >>> inputs = {"unbiased": x, "biased_a": y, "biased_b": y, "variance": y}
+        >>> print(combine_inputs(network, inputs)[0, 0].round(3))
+        [2.562]
 
     Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.
     """
-    check_same_shape(
-        unbiased=unbiased, biased_a=biased_a, biased_b=biased_b, variance=variance
-    )
-    valid, x, a, b, v = zero_invalid(unbiased, biased_a, biased_b, variance)
+    check_same_shape(**inputs)
+    names = "unbiased", "biased_a", "biased_b", "variance"
+    x, a, b, v = (inputs[name] for name in names)
+    instead = first_finite(a, b, x)
+    valid, x, a, b, v = zero_invalid(x, a, b, v)
     parameters = network(x, v, a, b)
     (s2,) = predicted_mean(v[None], parameters.kernels, kernel_window, mask=valid)
     if whiten:
@@ -144,4 +141,4 @@ def neural_combine_normalised(
     y = parameters.share * a + (1 - parameters.share) * b
     # An invalid pixel is not combined, and excluded from its neighbours' windows.
     shrunk = combine(x, y, jnp.where(valid, s2, jnp.nan), window=window, whiten=whiten)
-    return jnp.where(valid, shrunk, first_finite(biased_a, biased_b, unbiased))
+    return jnp.where(valid, shrunk, instead)

@@ -138,7 +138,9 @@ def _joint(network: networks.Joint, inputs: Mapping[str, Image]) -> Image:
     """Denoise, and combine with the denoised image."""
     x, v = inputs["noisy"], inputs["variance"]
     y = kernel_predicting.denoise_inputs(network.denoiser, inputs)
-    return james_stein.neural_combine_normalised(network.combiner, x, y, y, v)
+    images = {"unbiased": x, "biased_a": y, "biased_b": y, "variance": v}
+    paper = {"window": 15, "whiten": False}
+    return james_stein.combine_inputs(network.combiner, images, **paper)
 
 
 RECIPES = {

@@ -32,16 +32,15 @@ from jscomb.progressive._estimate import mixing, risk
 from jscomb.progressive._frame import (
     NEEDS,
     combine_frame,
-    combine_inputs,
     neural_combine_frame,
     neural_inputs,
     plan_neural,
 )
 from jscomb.progressive._neural import (
     activation,
+    combine_inputs,
     direct_activation,
     neural_combine,
-    neural_combine_normalised,
 )
 
 __all__ = [
@@ -55,7 +54,6 @@ __all__ = [
     "mixing",
     "neural_combine",
     "neural_combine_frame",
-    "neural_combine_normalised",
     "neural_inputs",
     "plan_neural",
     "risk",

@@ -6,7 +6,7 @@ guided by the frame's features, and has forward derivatives in the colour, such 
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,12 +17,7 @@ from jscomb.numerics.tiles import Local, compiled, network_plan
 from jscomb.numerics.variances import robust_variance
 from jscomb.progressive._combine import combine
 from jscomb.progressive._estimate import mixing
-from jscomb.progressive._neural import (
-    Activation,
-    Network,
-    direct_activation,
-    neural_combine_normalised,
-)
+from jscomb.progressive._neural import Network, combine_inputs
 from jscomb.typing import Image, Key
 
 Denoise = Callable[[Image, Frame], Any]
@@ -166,31 +161,3 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
     x, v = frame.color, robust_variance(frame.variance)
     y, s, _ = monte_carlo_sure(key, lambda color: denoise(color, frame), x, v)
     return {"unbiased": x, "biased": y, "variance": v, "sure": s}
-
-
-def combine_inputs(
-    network: Network,
-    inputs: Mapping[str, Image],
-    *,
-    activate: Activation = direct_activation,
-) -> Image:
-    """Mix what `neural_inputs` returns, without the bound.
-
-    Args:
-        network: as in `neural_combine`.
-        inputs: as `neural_inputs` returns them.
-        activate: alpha from the network's outputs.
-
-    Returns:
-        the mix, normalised radiance, shape [H,W,C].
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> at = lambda value: jnp.full((1, 1, 1), value)
-        >>> network = lambda *_: jnp.zeros((1, 1, 3, 1))
-        >>> names = "unbiased", "biased", "variance", "sure"
-        >>> inputs = dict(zip(names, map(at, (3.0, 1.0, 1.0, 2.0))))
-        >>> print(combine_inputs(network, inputs).item())
-        2.0
-    """
-    return neural_combine_normalised(network, **inputs, activate=activate, bound=False)

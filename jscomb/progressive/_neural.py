@@ -1,6 +1,6 @@
 """The mix with a network's alpha."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -102,35 +102,30 @@ def neural_combine(
     Source: PD eq. 11, 18, 19.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
-    combine_normalised = lambda *images: neural_combine_normalised(
-        network, *images, activate=activate, bound=bound
+    names = "unbiased", "biased", "variance", "sure"
+    normalised = lambda *images: combine_inputs(
+        network, dict(zip(names, images, strict=True)), activate=activate, bound=bound
     )
     squares = variance, sure
-    return at_unit_luminance(combine_normalised, unbiased, biased, squares=squares)
+    return at_unit_luminance(normalised, unbiased, biased, squares=squares)
 
 
-def neural_combine_normalised(
+def combine_inputs(
     network: Network,
-    unbiased: Image,
-    biased: Image,
-    variance: Variance,
-    sure: Image,
+    inputs: Mapping[str, Image],
     *,
-    activate: Activation = activation,
-    bound: bool = True,
+    activate: Activation = direct_activation,
+    bound: bool = False,
 ) -> Image:
-    """Mix normalised images; for crops of a normalised frame, and for training.
+    """Mix normalised images by name, for crops of a frame and for training.
 
     Not scale-equivariant, and local without the bound: `neural_combine` without its
     normalisation.
 
     Args:
         network: as for `neural_combine`.
-        unbiased: x, normalised radiance, shape [H,W,C].
-        biased: y, same shape.
-        variance: v of the mean x, at least zero, same shape.
-        sure: s, same shape.
-        activate: as for `neural_combine`.
+        inputs: unbiased, biased, variance and sure, as `neural_inputs` makes.
+        activate: alpha from the network's outputs.
         bound: lower alpha where the mix is not consistent with the noise.
 
     Returns:
@@ -141,17 +136,18 @@ def neural_combine_normalised(
         ValueError: while tracing, if shapes differ.
 
     Example:
-        >>> at = lambda value: jnp.full((3, 3, 1), value)
-        >>> network = lambda *_: jnp.stack([at(0.5), at(0.25), at(1.0)], axis=2)
-        >>> images = at(3.0), at(1.0), at(1.0), at(2.0)
-        >>> print(neural_combine_normalised(network, *images, bound=False)[0, 0])
-        [2.5]
+        >>> at = lambda value: jnp.full((1, 1, 1), value)
+        >>> network = lambda *_: jnp.zeros((1, 1, 3, 1))
+        >>> names = "unbiased", "biased", "variance", "sure"
+        >>> inputs = dict(zip(names, map(at, (3.0, 1.0, 1.0, 2.0))))
+        >>> print(combine_inputs(network, inputs).item())
+        2.0
 
-    Source: PD eq. 11, 18, 19.
+    Source: PD eq. 11, 18, 19; alpha as one output and no bound measured better.
     """
 
     def mix(*images: Image) -> Image:
         _, x, y, v, s = zero_invalid(*images)
         return activate(network(x, y, v, s))
 
-    return combine(unbiased, biased, variance, sure, mix=mix, bound=bound)
+    return combine(**inputs, mix=mix, bound=bound)
