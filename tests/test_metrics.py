@@ -149,7 +149,7 @@ def test_no_change_is_exactly_none_with_finite_derivatives():
         assert np.isfinite(gradient).all()
 
 
-def test_a_change_leaves_bad_pixels_out():
+def test_a_change_excludes_bad_pixels():
     x, y, z = jax.random.uniform(jax.random.key(0), (3, 2, 8, 8, 3))
     clean = metrics.rel_l2_change(z[:, 1:], y[:, 1:], x[:, 1:])
     for image in range(3):

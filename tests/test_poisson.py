@@ -111,7 +111,7 @@ def test_scale_equivariant(scale, value):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_missing_values_take_no_part(bad):
+def test_missing_values_are_excluded(bad):
     """Of y alone, of one gradient, and of whole pixels; as least squares without."""
     y, g, h = problem((9, 10))
     y = y.at[2, 3, 0].set(bad).at[7, 7].set(bad)

@@ -50,7 +50,7 @@ def reconstruct(
 
     Linear in the arrays and differentiable. A value that is not finite is excluded,
     without its neighbours. Transforms couple all pixels, so rounding errors are
-    relative to the frame's greatest value.
+    relative to the frame's largest value.
 
     Args:
         primal: y, linear radiance, shape [H,W,C].

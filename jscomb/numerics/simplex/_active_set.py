@@ -109,6 +109,6 @@ def search(
 
 
 def shared_by_equals(w: Flat, equal: Bool[Array, "n n m"]) -> Flat:
-    """Return the same weight for bases that are equal, each to itself too."""
+    """Return weights averaged over equal bases; each equals itself."""
     count = jnp.sum(equal, axis=1).astype(w.dtype)
     return jnp.sum(jnp.where(equal, w[None], 0.0), axis=1) / count
