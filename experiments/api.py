@@ -21,7 +21,8 @@ from pdoc.render_helpers import format_signature
 
 import jscomb
 
-_CLOSED = ("jscomb.cli", "jscomb.__main__")  # the command has its own help
+# The command has its own help; `exr` exports what reads and writes native files.
+_CLOSED = ("jscomb.cli", "jscomb.__main__", "jscomb.exr.native")
 
 
 def modules() -> dict[str, types.ModuleType]:

@@ -187,7 +187,7 @@ def combiners() -> dict[str, Entry]:
                     },
                 )
             ),
-            max(njs.reach, 7) + james_stein.reach(7),
+            max(njs.reach, 7) + james_stein.reach(window=7),
             multiple=njs.multiple,
         ),
         "ensemble.combine": Entry(_ensemble, rounding=1e-4),
@@ -247,9 +247,7 @@ def combiners() -> dict[str, Entry]:
             )
             for name, method in METHODS.items()
             # `denoised` returns its input; denoisers have entries of their own.
-            if method.pure
-            and method.takes == "one estimate"
-            and name != "denoised"
+            if method.pure and method.takes == "one estimate" and name != "denoised"
         },
     }
 
@@ -358,7 +356,7 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
         ),
     }
     if oidn.available():
-        found["oidn.denoise"] = Entry(
+        found["oidn.denoise_normalised"] = Entry(
             _normalised(lambda r: oidn.denoise_normalised(r.unbiased)),
             backwards=False,
         )

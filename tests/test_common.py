@@ -287,6 +287,7 @@ ELSEWHERE = {
         "james_stein.reach",
         "james_stein.regress",
         "james_stein.worth_regressing",
+        "kernel_predicting.denoise_inputs",
         "kernel_predicting.neural_inputs",
         "methods.choose",
         "methods.combine",

@@ -47,10 +47,10 @@ def with_halves(
         [0. 3.]
     """
     image = make(frame, *estimates_of(frame, given))
-    if not halves_possible(frame, given, needs=needs):
+    if not halves_possible(frame, *given, needs=needs):
         return Estimate(image)
     parts = [
-        (half, estimates_of(half, given, number))
+        (half, estimates_of(half, given, number=number))
         for number, half in enumerate(frame.halves())
     ]
     made = _leaves([own for _, own in parts])
@@ -59,12 +59,12 @@ def with_halves(
     return Estimate(image, jnp.stack([make(half, *own) for half, own in parts]))
 
 
-def halves_possible(frame: Frame, given: Any = (), *, needs: Needs) -> bool:
+def halves_possible(frame: Frame, *given: Any, needs: Needs) -> bool:
     """Return whether a combiner can be run on each half of a frame alone.
 
     Args:
         frame: the frame.
-        given: estimates of it, makers, or a tree of both.
+        given: estimates of it, makers, or trees of both.
         needs: what the combiner needs of a frame; with `needs.halves` an estimate is
             not enough, because its halves have no halves of their own.
 
@@ -84,7 +84,7 @@ def halves_possible(frame: Frame, given: Any = (), *, needs: Needs) -> bool:
     )
 
 
-def estimates_of(part: Frame, given: Any, number: int | None = None) -> Any:
+def estimates_of(part: Frame, given: Any, *, number: int | None = None) -> Any:
     """Return the estimates of a frame, or of one of its halves.
 
     Args:

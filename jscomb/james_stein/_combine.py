@@ -74,7 +74,7 @@ def combine(
     return jnp.where(valid, blend, first_finite(biased, unbiased))
 
 
-def reach(window: int = 15) -> int:
+def reach(*, window: int = 15) -> int:
     """Return how many pixels away `combine` sees: windows of shares and their mean.
 
     Args:
@@ -84,7 +84,7 @@ def reach(window: int = 15) -> int:
         the distance along either axis, in pixels.
 
     Example:
-        >>> print(reach(15))
+        >>> print(reach(window=15))
         14
     """
     return reach_of(window, window)

@@ -84,7 +84,7 @@ def plan_frame(
     rule = compiled(_combine_pooled, window=window, whiten=whiten)
     # The whitened rule sums over a window what each of its pixels pools.
     pool = reach_of(ROBUST_WINDOW) if whiten else 0
-    return Local(lambda i: rule(*i), images, pool + reach(window))
+    return Local(lambda i: rule(*i), images, pool + reach(window=window))
 
 
 def _combine_pooled(
@@ -266,7 +266,7 @@ def plan_neural(
         network,
         inputs,
         kernel=KERNEL,
-        around=reach(7),
+        around=reach(window=7),
     )
 
 

@@ -96,7 +96,7 @@ def choose(
     if not methods or not set(methods) <= METHODS.keys():
         raise ValueError(f"methods {list(methods)}: there are {', '.join(METHODS)}")
     frame = frame.normalised()
-    name = input_name(frame, biased)
+    name = input_name(frame, biased=biased)
     frame = with_input(key, frame, name)
     if frame.sub_buffers < 2 or frame.estimates[name].halves is None:
         known = not METHODS["whitened"].needs.missing(frame)

@@ -127,4 +127,4 @@ def _unchanged(
     """The frame's own estimate, bit by bit, if that is what the method returns."""
     if method != "denoised":
         return None
-    return frame.estimates.get(input_name(frame, biased))
+    return frame.estimates.get(input_name(frame, biased=biased))

@@ -13,7 +13,7 @@ _DENOISER = "oidn"  # for frames without an estimate
 
 
 def inputs(
-    frame: Frame, biased: str | Sequence[str] | None = None
+    frame: Frame, *, biased: str | Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return which bases an ensemble of a frame has, and why others are skipped.
 
@@ -67,13 +67,13 @@ def given_to(
             raise ValueError(f"{method} takes no biased image, got {biased!r}")
         return frame, ()
     if chosen.takes == "estimates":
-        names, skipped = inputs(frame, biased)
+        names, skipped = inputs(frame, biased=biased)
         if not names:
             raise ValueError(f"{method} has no bases: {_listed(skipped)}")
         for name in names:
             frame = with_input(key, frame, name)
         return frame, ({name: _maker(key, frame, name) for name in names},)
-    name = input_name(frame, biased)
+    name = input_name(frame, biased=biased)
     frame = with_input(key, frame, name)
     return frame, (_maker(key, frame, name),)
 
@@ -83,7 +83,7 @@ def _listed(reasons: Mapping[str, str]) -> str:
     return "; ".join(f"{name} {reason}" for name, reason in reasons.items())
 
 
-def input_name(frame: Frame, biased: str | Sequence[str] | None = None) -> str:
+def input_name(frame: Frame, *, biased: str | Sequence[str] | None = None) -> str:
     """Return the name of the biased image that a method of one estimate takes.
 
     Args:

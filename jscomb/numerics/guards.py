@@ -219,7 +219,7 @@ def weighted_ratio(
 
 def masked_mean(
     values: Float[Array, "h w c"],
-    mask: Mask | None = None,
+    mask: Mask | None,
     *,
     per_channel: bool = False,
     otherwise: float = 0.0,
