@@ -356,8 +356,8 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
         ),
     }
     if oidn.available():
-        found["oidn.denoise_normalised"] = Entry(
-            _normalised(lambda r: oidn.denoise_normalised(r.unbiased)),
+        found["oidn.denoise"] = Entry(
+            lambda r: oidn.denoise(r.unbiased),
             backwards=False,
         )
     return found

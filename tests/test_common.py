@@ -304,11 +304,11 @@ ELSEWHERE = {
         "uncorrelated.combine_frame",
         "uncorrelated.select_gamma_frame",
     },
-    "normalise, and call what is here": {
+    "what is here with normalisation, or without": {
         "double_shrinkage.neural_combine",
         "james_stein.neural_combine",
         "kernel_predicting.denoise",
-        "oidn.denoise",
+        "oidn.denoise_normalised",
         "progressive.neural_combine",
     },
     "of functions": {
