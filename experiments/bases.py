@@ -1,16 +1,25 @@
 """The bases of the ensemble experiments: six real denoisers, each with halves."""
 
-from jscomb.denoisers import bilateral, nonlocal_means, oidn, rdfc, smoothing
-from jscomb.frame import Estimate, Frame, Maker, with_halves
+import functools
 
-BASES: dict[str, Maker] = {
-    "oidn": lambda frame: frame.estimates.get("oidn") or oidn.denoise_frame(frame),
-    "oidn, no features": lambda frame: oidn.denoise_frame(frame, features=False),
-    "bilateral": bilateral.denoise_frame,
-    "gaussian": smoothing.denoise_frame,
-    "non-local means": nonlocal_means.denoise_frame,
-    "rdfc": rdfc.denoise_frame,
-}
+import jax
+
+from jscomb.frame import Estimate, Frame, Maker, with_halves
+from jscomb.methods import METHODS
+
+BASES = "oidn", "oidn-color", "bilateral", "gaussian", "nonlocal-means", "rdfc"
+
+
+def maker(name: str) -> Maker:
+    """A denoiser of the table of methods.
+
+    Args:
+        name: key of `METHODS`.
+
+    Returns:
+        the function from a normalised frame to its estimate.
+    """
+    return functools.partial(METHODS[name].estimate, jax.random.key(0))
 
 
 def bases_of(frame: Frame) -> dict[str, Estimate]:
@@ -23,7 +32,9 @@ def bases_of(frame: Frame) -> dict[str, Estimate]:
     Returns:
         the estimates, with halves.
     """
-    return {name: make(frame) for name, make in BASES.items()}
+    made = {name: maker(name) for name in BASES if name not in frame.estimates}
+    of = lambda name: frame.estimates.get(name) or made[name](frame)
+    return {name: of(name) for name in BASES}
 
 
 def unbiased_of(frame: Frame) -> Estimate:

@@ -32,4 +32,4 @@ __all__ = [
     "table",
 ]
 
-__doc__ += f"\n{table()}\n"
+__doc__ = f"{__doc__}\n{table()}\n"

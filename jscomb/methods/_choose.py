@@ -55,7 +55,7 @@ def choose(
     key: Key,
     frame: Frame,
     *,
-    biased: str | None = None,
+    biased: str | Sequence[str] | None = None,
     budget: float | None = None,
     methods: Sequence[str] = CANDIDATES,
 ) -> Choice:
