@@ -175,6 +175,17 @@ def test_what_needs_halves_is_judged_by_quarters(glass_frame):
     assert trials[1].reason == "pd does not take photons"
 
 
+@needs_oidn
+def test_denoisers_and_ensembles_can_be_chosen_from(glass_frame):
+    """The half of an ensemble has weights of its own; a blur is no better."""
+    names = ["denoised", "gaussian", "ensemble"]
+    found = choose(key(), glass_frame, methods=names)
+    assert [trial.reason for trial in found.trials] == ["", ""]
+    blur, mixed = (float(trial.change.mean) for trial in found.trials)
+    assert mixed < blur
+    assert blur > 0
+
+
 def test_without_halves_nothing_is_judged(glass_frame):
     whitened = methods.Choice("whitened", (), None)
     assert choose(key(), glass_frame.merged(1)) == whitened

@@ -11,7 +11,13 @@ from jaxtyping import Array, Float
 
 from jscomb import metrics
 from jscomb.frame import Frame, estimates_of
-from jscomb.methods._inputs import can_make, given_to, input_name, with_input
+from jscomb.methods._inputs import (
+    can_make,
+    given_to,
+    input_name,
+    taken_by,
+    with_input,
+)
 from jscomb.methods._table import CANDIDATES, METHODS
 from jscomb.typing import Key
 
@@ -131,11 +137,12 @@ def _best(trials: Sequence[Trial]) -> str | None:
 def _unfit(method: str, frame: Frame, name: str) -> str:
     """Why a method cannot be judged with this biased image; else empty."""
     chosen = METHODS[method]
-    if chosen.takes == "nothing" and name != chosen.denoiser:
+    if chosen.denoiser not in (None, name):
         return f"{method} does not take {name}"
     if missing := chosen.needs.missing_for_halves(frame):
         return f"{method} needs {missing}"
-    if chosen.needs.halves and not can_make(name, frame):
+    alone = chosen.takes == "one estimate" and chosen.needs.halves
+    if alone and not can_make(name, frame):
         return f"{method} needs {name} of quarters, which only a denoiser can make"
     return ""
 
@@ -147,7 +154,7 @@ def _halves(
     images, seconds = [], 0.0
     for half in frame.halves():
         start = time.perf_counter()
-        half, given = given_to(key, half, method, name)
+        half, given = given_to(key, half, method, taken_by(method, name))
         image = METHODS[method].image(key, half, *estimates_of(half, given))
         images.append(jax.block_until_ready(image))
         seconds = time.perf_counter() - start  # the second half without compilation

@@ -6,7 +6,7 @@ import jax
 
 from jscomb.frame import Estimate, Frame, estimates_of
 from jscomb.methods._choose import choose
-from jscomb.methods._inputs import given_to, input_name
+from jscomb.methods._inputs import given_to, input_name, taken_by
 from jscomb.methods._table import METHODS
 from jscomb.numerics.tiles import Local
 from jscomb.typing import Key
@@ -60,6 +60,7 @@ def combine(
     if method is None:
         found = choose(key, whole, biased=biased, budget=budget)
         method, halves = found.method, found.halves
+        biased = taken_by(method, biased)
     if (unchanged := _unchanged(frame, method, biased)) is not None:
         return unchanged
     whole, given = given_to(key, whole, method, biased)

@@ -78,6 +78,13 @@ def given_to(
     return frame, (_maker(key, frame, name),)
 
 
+def taken_by(
+    method: str, biased: str | Sequence[str] | None
+) -> str | Sequence[str] | None:
+    """The biased image, if the method takes one; None for what it takes by itself."""
+    return biased if METHODS[method].takes == "one estimate" else None
+
+
 def _listed(reasons: Mapping[str, str]) -> str:
     """Names and reasons in one line."""
     return "; ".join(f"{name} {reason}" for name, reason in reasons.items())
