@@ -208,13 +208,13 @@ def test_an_ensemble_says_what_it_skips(glass_frame):
     names, skipped = methods.inputs(glass_frame.normalised())
     assert set(names) == set(BASES if oidn.available() else BASES[2:4])
     assert not set(names) & set(skipped)
-    one = glass_frame.merged(1).with_estimate("y", glass_frame.color)
-    names, skipped = methods.inputs(one.normalised())
+    bare = glass_frame._replace(estimates={}).with_estimate("y", glass_frame.color)
+    names, skipped = methods.inputs(bare.merged(1).normalised())
     assert names == ()
     assert skipped["y"] == "it has no halves"
     assert skipped["bilateral"].startswith("needs half buffers: render at least 2")
     with pytest.raises(ValueError, match=r"no bases: .*y it has no halves"):
-        combine(key(), one, method="ensemble")
+        combine(key(), bare, method="ensemble", biased="y")
 
 
 def test_bad_input(glass_frame):
