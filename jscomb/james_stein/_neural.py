@@ -51,10 +51,10 @@ def neural_combine(
         network: of x, v, y^_a and y^_b, finite and normalised, such as
             `learning.networks.JamesSteinNetwork`.
         unbiased: x, linear radiance, shape [H,W,C].
-        biased_a: y^_a of `cross_regression`, likewise; or the biased image itself.
-        biased_b: y^_b, likewise.
+        biased_a: y^_a of `cross_regression`, or the biased image, same shape.
+        biased_b: y^_b, same shape.
         variance: sample variance of the mean x, squared radiance, at least zero,
-            likewise.
+            same shape.
         window: width of the windows that are shrunk, in pixels, odd, at least three.
         kernel_window: width of the network's kernels in pixels, odd.
         whiten: allow each pixel its own variance within a window: the greater of its

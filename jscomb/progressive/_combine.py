@@ -114,7 +114,7 @@ def bound_mixing(
         0.009
 
     Source: PD eq. 12-18. The width of the Gaussian there is absolute; here it is
-    relative to the mean radiance, which is the same at an exposure of about one.
+    relative to the mean radiance, which is the same for normalised images.
     """
     check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased, variance=variance)
     valid, alpha, x, y, v = zero_invalid(mixing, unbiased, biased, variance)
