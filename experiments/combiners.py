@@ -129,6 +129,10 @@ def combiners() -> dict[str, Combiner]:
     return {
         "path tracing": Combiner(lambda frame, scale: frame.color, 0, traced=True),
         **{name: _of_method(name, method) for name, method in METHODS.items()},
+        # The frame's own, whose time is counted apart.
+        "oidn": Combiner(
+            lambda frame, scale: frame.estimates["oidn"].image, 1, traced=True
+        ),
         "nfor of stride 2": Combiner(
             lambda frame: nfor.denoise_frame(frame, stride=2).image, 0
         ),

@@ -17,9 +17,9 @@ from experiments import (
     stability,
     sweep,
 )
-from experiments.combiners import COMBINERS
+from experiments.combiners import combiners
 from jscomb import metrics
-from jscomb.choice import CANDIDATES
+from jscomb.methods import CANDIDATES
 
 FEW = ("path tracing", "oidn", "whitened")
 
@@ -159,14 +159,14 @@ def test_a_severely_biased_image_is_kept_out(archive):
 
 
 @pytest.mark.parametrize(
-    "name", [n for n in COMBINERS if n.startswith(("ens", "prog"))]
+    "name", [n for n in combiners() if n.startswith(("ens", "prog"))]
 )
 def test_combiners_make_images(name, glass_frame):
     """Those that no other test runs; on a corner."""
     corner = jax.tree.map(
         lambda leaf: leaf[..., :40, :40, :] if leaf.ndim >= 3 else leaf, glass_frame
     )
-    image = COMBINERS[name].combine(corner)
+    image = combiners()[name].combine(corner)
     assert image.shape == (40, 40, 3)
     assert np.isfinite(image).all()
 

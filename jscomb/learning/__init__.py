@@ -1,6 +1,6 @@
 """Networks that decide what the estimators leave open, and their training.
 
-`recipes` defines what each network sees and how its output makes an image, and loads the
+`recipes` defines what each network sees, how its output makes an image, and loads the
 parameters that come with the package; `networks` are the papers'; `training`, `losses`
 and `checkpoints` make and store others. `networks` and `recipes` import flax, which is
 slow, so modules are imported by name::
