@@ -308,7 +308,8 @@ def test_nfor_survives_bad_pixels():
 
 @pytest.mark.usefixtures("unchecked")
 def test_frame_without_what_it_needs():
-    with pytest.raises(ValueError, match="nfor needs half buffers: render at least 4"):
+    lacking = "nfor needs half buffers: render with variances, or at least 4"
+    with pytest.raises(ValueError, match=lacking):
         nfor.denoise_frame(make_frame(jnp.ones((4, 4, 3))))
     with pytest.raises(ValueError, match="strength must be positive, got 0"):
         nonlocal_means.weights(jnp.ones((4, 4, 3)), jnp.ones((4, 4, 3)), strength=0.0)
