@@ -93,7 +93,7 @@ def run(config: Config) -> dict[str, dict[str, tuple[float, float]]]:
         config: what to measure.
 
     Returns:
-        results of `measure` by the frame's name.
+        results of `measure` by path.
 
     Raises:
         ValueError: if a frame has no reference, or not four sub-buffers.
@@ -103,7 +103,7 @@ def run(config: Config) -> dict[str, dict[str, tuple[float, float]]]:
         frame = exr.read_frame(path)
         if frame.reference is None or frame.sub_buffers % 4:
             raise ValueError(f"{path} needs a reference and four sub-buffers")
-        rows[path.stem] = measure(frame.merged(4).normalised())
+        rows[str(path)] = measure(frame.merged(4).normalised())
     return rows
 
 

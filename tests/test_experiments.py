@@ -9,6 +9,7 @@ from experiments import (
     bias,
     bundle,
     correlation,
+    dependence,
     double_shrinkage,
     double_shrinkage_speed,
     ensemble,
@@ -236,3 +237,20 @@ def test_the_cost_of_networks_is_their_convolutions():
     full = 2 * (25 * 18 * 48 + 4 * 9 * 48 * 48 + 9 * 48 * 9)
     assert learned_speed.operations(network) == full
     assert costs["pd light"].operations < full / 3
+
+
+def test_shared_weights_are_measured_beside_own_ones(glass_frame, tmp_path):
+    """An ensemble is better than its first base, which the halves underestimate."""
+    if not oidn.available():
+        pytest.skip("needs Open Image Denoise")
+    path = tmp_path / "glass.exr"
+    exr.write_frame(path, glass_frame)
+    rows = dependence.run(dependence.Config((path, path), quick=True))
+    (row,) = rows.values()
+    for estimated, true in (row["shared"], row["own"]):
+        assert true < estimated < 0
+    assert row["shared"] != row["own"]
+    assert len(dependence.table(rows)) == 5
+    exr.write_frame(path, glass_frame.merged(2))
+    with pytest.raises(ValueError, match="needs a reference and four sub-buffers"):
+        dependence.run(dependence.Config((path,)))

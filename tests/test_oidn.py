@@ -7,7 +7,7 @@ import pytest
 
 from jscomb import metrics
 from jscomb.denoisers import oidn
-from jscomb.frame import make_frame
+from jscomb.frame import Package, make_frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
 
@@ -105,7 +105,8 @@ def test_rejects_bad_input(glass_frame, monkeypatch):
     grey = make_frame(color[..., :1]).normalised()
     with pytest.raises(ValueError, match="oidn needs 3 channels of colour, not 1"):
         oidn.denoise_frame(grey)
-    monkeypatch.setattr(oidn, "NEEDS", oidn.NEEDS._replace(package="not_installed"))
+    missing = oidn.NEEDS._replace(package=Package("not_installed", "oidn"))
+    monkeypatch.setattr(oidn, "NEEDS", missing)
     assert not oidn.available()
     for denoise in (
         lambda: oidn.denoise(color),
