@@ -2,12 +2,10 @@
 
     python -m experiments.api FOLDER
 
-Public is what a user reaches by the front doors: the names that a package exports, and
-in a module that is imported by itself every name without underscore. A warning of pdoc
+Public is what stands in the `__all__` of a module without underscore. A warning of pdoc
 ends it: then a docstring or an import is broken.
 """
 
-import ast
 import importlib
 import inspect
 import pathlib
@@ -23,37 +21,16 @@ from pdoc.render_helpers import format_signature
 
 import jscomb
 
-# Packages whose modules are imported by themselves. All others are front doors: what
-# lies behind them is public only if they export it.
-_OPEN = {"jscomb", "jscomb.denoisers", "jscomb.learning", "jscomb.numerics"}
-# The command has its own help; `of_parts` is exported by `denoisers`.
-_CLOSED = {"jscomb.cli", "jscomb.__main__", "jscomb.denoisers.parts"}
+# The command has its own help; `exr` exports what reads and writes native files.
+_CLOSED = ("jscomb.cli", "jscomb.__main__", "jscomb.exr.native")
 
 
 def modules() -> dict[str, types.ModuleType]:
     """The public modules and packages by their names."""
     found = pkgutil.walk_packages(jscomb.__path__, "jscomb.")
-    names = [m.name for m in found if m.name.rpartition(".")[0] in _OPEN]
-    public = ["jscomb", *(name for name in names if name not in _CLOSED)]
+    names = ["jscomb", *(m.name for m in found)]
+    public = [n for n in names if "._" not in n and not n.startswith(_CLOSED)]
     return {name: importlib.import_module(name) for name in public}
-
-
-def names(module: types.ModuleType) -> list[str]:
-    """The public functions and classes of a module, and all that a package exports.
-
-    Args:
-        module: one of `modules`.
-
-    Returns:
-        the names in the order of the source.
-    """
-    found = []
-    for node in ast.parse(inspect.getsource(module)).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found.append(node.name)
-        elif isinstance(node, ast.ImportFrom):
-            found += [alias.name for alias in node.names if alias.name == alias.asname]
-    return [name for name in found if not name.startswith("_")]
 
 
 class _Written(str):
@@ -98,17 +75,10 @@ def main(folder: str) -> None:
     Args:
         folder: where to; made if it is not there.
     """
-    public = modules()
-    for name, module in public.items():
-        for each in names(module):
+    for module in modules().values():
+        for each in getattr(module, "__all__", ()):
             if inspect.isclass(found := getattr(module, each)):
                 _only_own_words(found)
-        if hasattr(module, "__path__"):
-            inside = [m.rpartition(".") for m in public]
-            inside = [last for package, _, last in inside if package == name]
-            module.__all__ = [*dict.fromkeys(names(module) + inside)]
-    every = pkgutil.walk_packages(jscomb.__path__, "jscomb.")
-    hidden = [f"!{re.escape(m.name)}$" for m in every if m.name not in public]
     pdoc.render.configure(
         docformat="google",
         show_source=False,
@@ -118,6 +88,7 @@ def main(folder: str) -> None:
     warnings.simplefilter("error")
     # optax's type of a state names itself.
     warnings.filterwarnings("ignore", "Error parsing type annotation .*ArrayTree")
+    hidden = [f"!{re.escape(name)}" for name in _CLOSED]
     pdoc.pdoc("jscomb", *hidden, output_directory=pathlib.Path(folder))
 
 

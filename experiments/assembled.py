@@ -1,7 +1,7 @@
-"""EXR files put together byte by byte, as no library would write them.
+"""Assemble EXR files byte by byte, as no library would write them.
 
-A header is a list of attributes (name, type, size, value), then come the offsets of the
-chunks, then the chunks: pixels with their place and size.
+A header is a list of attributes (name, type, size, value); then come the offsets of the
+chunks, then the chunks: pixels with their position and size.
 """
 
 import struct
@@ -14,12 +14,12 @@ import numpy as np
 def assembled(
     changed: dict[str, tuple[str, bytes]], chunks: list[bytes], *, flags: int = 0
 ) -> bytes:
-    """A file put together by hand: 8x8 grey pixels, uncompressed.
+    """Return a file of 8x8 grey pixels, uncompressed.
 
     Args:
-        changed: attributes, type and value, that differ from such a file's.
+        changed: attributes to change or add, type and value by name.
         chunks: in order.
-        flags: of the version.
+        flags: of the version field.
 
     Returns:
         the file.
@@ -47,33 +47,19 @@ TILED, MULTI_PART = 0x200, 0x1000
 
 
 def rows(grey: np.ndarray) -> bytes:
-    """A file of rows.
-
-    Args:
-        grey: the image, 8x8.
-
-    Returns:
-        the file.
-    """
+    """Return a file of an 8x8 image in rows."""
     return assembled({}, [_chunk(y, row.tobytes()) for y, row in enumerate(grey)])
 
 
 def subsampled(sampling: int) -> bytes:
-    """A file of two channels, one of them subsampled.
-
-    Args:
-        sampling: pixels a sample, along each axis.
-
-    Returns:
-        the file.
-    """
+    """Return a file of two channels, one of them subsampled along both axes."""
     channels = _channels("R", sampling) + _channels("Y") + b"\0"
     chunks = [_chunk(y, bytes(4 * (8 + 4 * (y % 2 == 0)))) for y in range(8)]
     return assembled({"channels": ("chlist", channels)}, chunks)
 
 
 def levels(grey: np.ndarray, mode: int) -> bytes:
-    """A tiled file with its smaller versions.
+    """Return a tiled file of an 8x8 image with its smaller versions.
 
     Args:
         grey: the image, 8x8.
@@ -97,10 +83,10 @@ def levels(grey: np.ndarray, mode: int) -> bytes:
 
 
 def claims() -> Iterator[tuple[str, bytes]]:
-    """Small files that claim to be large, or what cannot be.
+    """Yield small files with huge or impossible claims.
 
     Yields:
-        what is claimed, and the file; its pixels, if there are any, are black.
+        what is claimed, and the file; its pixels, if any, are black.
     """
     for claim, files in {
         "windows": _window_claims,
@@ -112,14 +98,14 @@ def claims() -> Iterator[tuple[str, bytes]]:
             yield claim, data
 
 
-MOST = 2**31 - 1
+INT_MAX = 2**31 - 1
 
 
 def _window_claims() -> Iterator[bytes]:
-    """Windows that are huge, overflow 32 bits, or have no inside."""
+    """Yield windows that are huge, overflow 32 bits, or are empty."""
     for window in (
-        (0, 0, MOST - 1, MOST - 1),
-        (-MOST - 1, -MOST - 1, MOST, MOST),
+        (0, 0, INT_MAX - 1, INT_MAX - 1),
+        (-INT_MAX - 1, -INT_MAX - 1, INT_MAX, INT_MAX),
         (0, 0, 46340, 46340),
         (0, 0, 2**30, 0),
         (0, 0, 0, 2**30),
@@ -131,11 +117,11 @@ def _window_claims() -> Iterator[bytes]:
 
 
 def _tile_claims() -> Iterator[bytes]:
-    """Tiles that are huge or have no inside, in every mode and one that is none."""
+    """Yield tiles that are huge or empty, in every mode and an unknown one."""
     for width, height in (
         (2**14, 2**14),
         (2**16, 2**16),
-        (MOST, MOST),
+        (INT_MAX, INT_MAX),
         (2**31, 2**31),
         (2**32 - 1, 1),
         (0, 4),
@@ -146,23 +132,23 @@ def _tile_claims() -> Iterator[bytes]:
 
 
 def _header_claims() -> Iterator[bytes]:
-    """Many channels, none, one twice; attributes longer than the file."""
+    """Yield many channels, none, duplicates; attributes longer than the file."""
     many = "".join(map(chr, range(0x4E00, 0x4E00 + 5000)))
     for channels in (_channels(many), b"", 2 * _channels("Y")):
         listed = {"channels": ("chlist", channels + b"\0")}
         yield assembled(listed, _rows())
         yield assembled(listed | {"dataWindow": _box(0, 0, 999, 999)}, _rows())
     whole = assembled({"x": ("string", b"abcd")}, _rows())
-    for size in (MOST, 2**28, -1, -MOST - 1):
+    for size in (INT_MAX, 2**28, -1, -INT_MAX - 1):
         yield whole.replace(b"\4\0\0\0abcd", struct.pack("<i", size) + b"abcd")
-    for side in (2**16, MOST):
+    for side in (2**16, INT_MAX):
         preview = struct.pack("<II", side, side) + bytes(16)
         yield assembled({"preview": ("preview", preview)}, _rows())
 
 
 def _chunk_claims() -> Iterator[bytes]:
-    """Chunks of wrong number, size, row and place; one that unpacks to 256 MiB."""
-    for count in (MOST, 2**24, 0, -1):
+    """Yield chunks of wrong number, size, row, offset; one unpacks to 256 MiB."""
+    for count in (INT_MAX, 2**24, 0, -1):
         part = {
             "name": ("string", b"a"),
             "type": ("string", b"scanlineimage"),
@@ -170,9 +156,9 @@ def _chunk_claims() -> Iterator[bytes]:
         }
         yield assembled(part, _rows(), flags=MULTI_PART)
     before, after = _rows()[:4], _rows()[5:]
-    for size in (MOST, 2**28, 33, 31, 0, -1, -MOST - 1):
+    for size in (INT_MAX, 2**28, 33, 31, 0, -1, -INT_MAX - 1):
         yield assembled({}, [*before, _chunk(4, bytes(32), size=size), *after])
-    for row in (MOST, 8, 3, -1, -MOST - 1):
+    for row in (INT_MAX, 8, 3, -1, -INT_MAX - 1):
         yield assembled({}, [*before, _chunk(row, bytes(32)), *after])
     whole = assembled({}, _rows())
     first = struct.pack("<q", whole.index(_rows()[0]))
@@ -183,26 +169,26 @@ def _chunk_claims() -> Iterator[bytes]:
 
 
 def _rows() -> list[bytes]:
-    """The chunks of a black image."""
+    """Return the chunks of a black image."""
     return [_chunk(row, bytes(32)) for row in range(8)]
 
 
 def _box(left: int, top: int, right: int, bottom: int) -> tuple[str, bytes]:
-    """A window."""
+    """Return a window attribute."""
     return "box2i", struct.pack("<4i", left, top, right, bottom)
 
 
 def _tiles(width: int, height: int, mode: int) -> tuple[str, bytes]:
-    """A description of tiles."""
+    """Return a tile description attribute."""
     return "tiledesc", struct.pack("<IIB", width, height, mode)
 
 
 def _channels(names: str, sampling: int = 1) -> bytes:
-    """Entries of 32-bit float channels, of one letter each."""
+    """Return entries of 32-bit float channels with one-letter names."""
     end = b"\0" + struct.pack("<4i", 2, 0, sampling, sampling)
     return b"".join(name.encode() + end for name in names)
 
 
 def _chunk(row: int, pixels: bytes, *, size: int | None = None) -> bytes:
-    """A row of pixels."""
+    """Return a chunk of one row of pixels."""
     return struct.pack("<ii", row, len(pixels) if size is None else size) + pixels

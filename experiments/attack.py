@@ -1,14 +1,13 @@
-"""What do damaged, hostile and unusual EXR files do?
+"""Read damaged, hostile and unusual EXR files, and write where writing fails.
 
     python -m experiments.attack
 
-Every file of the corpus (`hostile`) is read in another process, which has little memory
-and little time, so that a crash, a hang and a claim that is believed are seen. What
-comes of it is good: the right image, or one clear error; or, where nothing in the file
-tells of a change to it, another image. All else is bad, and then the exit status is 1.
-So is any write that fails (read-only folder, full disk) and leaves something damaged
-behind or says nothing clear, and any read of a file that others write at the same time
-that is not one of theirs.
+Every file of the corpus (`hostile`) is read in another process with little memory and
+little time, so that crashes, hangs and believed claims are seen. Good outcomes are the
+right image, one clear error, or another image where the file has no checksum that
+covers the change. All else is bad, and then the exit status is 1. Also bad are a failed
+write (read-only folder, full disk) that leaves a damaged file or gives no clear error,
+and a read during concurrent writes that returns none of the written frames.
 """
 
 import collections
@@ -36,15 +35,15 @@ from jscomb import exr
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """What to try.
+    """Limits of the attempts.
 
     Attributes:
         seed: of the images.
-        step: only every so many bytes are damaged.
+        step: bytes from one damage to the next.
         limit: mebibytes that a file may claim.
-        headroom: mebibytes that reading may take beside what the process has.
+        headroom: mebibytes that reading may allocate.
         seconds: that an attempt may take.
-        quick: few bytes are damaged.
+        quick: damage few bytes.
     """
 
     seed: int = 0
@@ -70,41 +69,33 @@ Read = Callable[[str, int], Arrays]
 
 
 def read(path: str, limit: int) -> Arrays:
-    """What jscomb reads.
-
-    Args:
-        path: an EXR file.
-        limit: bytes that it may claim.
-
-    Returns:
-        the frame's arrays.
-    """
+    """Return the arrays of a frame that may claim at most `limit` bytes."""
     return hostile.arrays(exr.read_frame(path, max_bytes=limit))
 
 
 def prepare() -> None:
-    """Read and write once, so that all is imported and JAX has what it needs."""
+    """Read and write once, so that everything is imported and JAX has started."""
     with tempfile.TemporaryDirectory() as name:
         write(f"{name}/frame.exr", 0)
         read(f"{name}/frame.exr", 2**30)
 
 
 def _worker(config: Config) -> Worker:
-    """To attempt in."""
+    """Return a process to attempt in."""
     return Worker(prepare, config.headroom * 2**20, config.seconds)
 
 
 def verdict(path: str, reply: Reply, right: Arrays | None, tolerance: float) -> str:
-    """The outcome of reading a file.
+    """Return the outcome of reading a file, one of `GOOD` or `BAD`.
 
     Args:
         path: the file.
-        reply: what came of it.
-        right: what it holds; None if only an error is right.
-        tolerance: largest difference from that.
+        reply: of the attempt.
+        right: arrays of the frame in the file; None if only an error is right.
+        tolerance: largest difference from them.
 
     Returns:
-        one of `GOOD` (but not "no checksum") or `BAD`.
+        the outcome; "no checksum" is left to the caller.
     """
     if reply.failure:
         return reply.failure
@@ -119,7 +110,7 @@ def verdict(path: str, reply: Reply, right: Arrays | None, tolerance: float) -> 
 
 
 def _same(a: Arrays, b: Arrays, tolerance: float) -> bool:
-    """Whether two frames hold the same arrays."""
+    """Return whether two frames have the same arrays."""
     return a.keys() == b.keys() and all(
         a[k].shape == b[k].shape
         and np.allclose(a[k], b[k], rtol=0, atol=tolerance, equal_nan=True)
@@ -130,16 +121,16 @@ def _same(a: Arrays, b: Arrays, tolerance: float) -> bool:
 def read_all(
     cases: Iterable[Case], folder: pathlib.Path, config: Config, *, read: Read = read
 ) -> Table:
-    """Read every file of a corpus.
+    """Return the outcomes of reading every file of a corpus.
 
     Args:
         cases: the corpus.
         folder: for the files.
         config: the limits.
-        read: of a module; gives the arrays of a path within a limit.
+        read: function at the top of a module, from a path and a limit to arrays.
 
     Returns:
-        outcomes.
+        counts of outcomes by kind.
     """
     table: Table = collections.defaultdict(collections.Counter)
     path = str(folder / "case.exr")
@@ -148,7 +139,7 @@ def read_all(
             pathlib.Path(path).write_bytes(case.data)
             reply = worker.attempt(read, path, config.limit * 2**20)
             outcome = verdict(path, reply, case.right, case.tolerance)
-            if outcome == "wrong image" and not case.told:
+            if outcome == "wrong image" and not case.has_checksum:
                 outcome = "no checksum"
             table[case.kind][outcome] += 1
             if outcome in BAD:
@@ -157,33 +148,18 @@ def read_all(
 
 
 def write(path: str, seed: int) -> None:
-    """What jscomb writes.
-
-    Args:
-        path: the file.
-        seed: of the frame.
-    """
+    """Write the frame of a seed."""
     exr.write_frame(path, hostile.own_frame(seed))
 
 
 def write_often(path: str, seed: int) -> None:
-    """Write, again and again.
-
-    Args:
-        path: the file.
-        seed: of the frame.
-    """
+    """Write it again and again."""
     for _ in range(100):
         write(path, seed)
 
 
 def write_as_nobody(path: str, seed: int) -> None:
-    """Write as a user who may not, even if this one is root.
-
-    Args:
-        path: the file.
-        seed: of the frame.
-    """
+    """Write as a user without permission, even if this process is root."""
     user = os.geteuid()
     if user == 0:
         os.seteuid(65534)
@@ -194,13 +170,7 @@ def write_as_nobody(path: str, seed: int) -> None:
 
 
 def write_little(path: str, seed: int, size: int) -> None:
-    """Write where no file may be larger than that.
-
-    Args:
-        path: the file.
-        seed: of the frame.
-        size: in bytes.
-    """
+    """Write where files are limited to `size` bytes."""
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -212,23 +182,23 @@ def write_little(path: str, seed: int, size: int) -> None:
 def written(
     worker: Worker, folder: pathlib.Path, function: Callable, *arguments: Any
 ) -> str:
-    """The outcome of writing over a file.
+    """Return the outcome of writing over a file.
 
     Args:
         worker: to write and read in.
         folder: with the file.
-        function: writes a path and a seed.
-        arguments: its other ones.
+        function: writes to a path the frame of a seed.
+        arguments: its other arguments.
 
     Returns:
-        the outcome; a file is damaged if it has changed in spite of an error, or is not
+        the outcome; a file is damaged if it changed despite an error, or differs from
         what was written.
     """
     path, contents = folder / "old.exr", lambda: _contents(folder)
     before = contents()
     reply = worker.attempt(function, str(path), NEW, *arguments)
     outcome = verdict(str(path), reply, None, 0)
-    if outcome == "wrong image":  # no error, so it must be there
+    if outcome == "wrong image":  # no error: the new frame must be there
         reply = worker.attempt(read, str(path), 2**30)
         outcome = verdict(str(path), reply, hostile.arrays(hostile.own_frame(NEW)), 0)
         alone = contents().keys() == before.keys()
@@ -240,19 +210,20 @@ OLD, NEW = 100, 200  # seeds
 
 
 def _contents(folder: pathlib.Path) -> dict[str, bytes]:
-    """All files of a folder."""
+    """Return all files of a folder."""
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
 def write_all(folder: pathlib.Path, config: Config) -> Table:
-    """Write where that is hard.
+    """Return the outcomes of writing where it is difficult.
 
     Args:
         folder: for the files.
         config: the limits.
 
     Returns:
-        outcomes; a kind that this machine cannot try has none, and says why.
+        counts of outcomes by kind; empty for a kind that this machine cannot try, with
+        the reason in its name.
     """
     table: Table = collections.defaultdict(collections.Counter)
     path = folder / "old.exr"
@@ -280,7 +251,7 @@ def write_all(folder: pathlib.Path, config: Config) -> Table:
 
 @contextlib.contextmanager
 def _disk(folder: pathlib.Path, kibibytes: int) -> Iterator[tuple[pathlib.Path, str]]:
-    """A disk of that size, or why there is none."""
+    """Mount a disk of that size; yield its folder, and the reason if that fails."""
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={kibibytes}k", "tmpfs", str(folder)]
     try:
@@ -297,7 +268,7 @@ def _disk(folder: pathlib.Path, kibibytes: int) -> Iterator[tuple[pathlib.Path, 
 
 
 def _race(worker: Worker, path: pathlib.Path, config: Config) -> collections.Counter:
-    """Reads of a file that two processes write; each must be one of both."""
+    """Count outcomes of reading a file that two processes write."""
     found: collections.Counter[str] = collections.Counter()
     rights = [hostile.arrays(hostile.own_frame(seed)) for seed in (OLD, NEW)]
     writers = [_worker(config), _worker(config)]
@@ -319,14 +290,7 @@ def _race(worker: Worker, path: pathlib.Path, config: Config) -> collections.Cou
 
 
 def run(config: Config) -> Table:
-    """Try everything.
-
-    Args:
-        config: what to try.
-
-    Returns:
-        outcomes.
-    """
+    """Return the counts of outcomes of everything, by kind."""
     step = 40 * config.step if config.quick else config.step
     with tempfile.TemporaryDirectory() as name:
         files, writing = pathlib.Path(name, "files"), pathlib.Path(name, "writing")
@@ -338,14 +302,7 @@ def run(config: Config) -> Table:
 
 
 def bad(table: Table) -> int:
-    """How many outcomes are bad.
-
-    Args:
-        table: outcomes.
-
-    Returns:
-        the number.
-    """
+    """Return how many outcomes are bad."""
     return sum(counts[outcome] for counts in table.values() for outcome in BAD)
 
 

@@ -1,41 +1,42 @@
 """The bases of the ensemble experiments: six real denoisers, each with halves."""
 
-from collections.abc import Callable
+import functools
 
 import jax
 
-from jscomb.denoisers import bilateral, nonlocal_means, of_parts, oidn, rdfc, smoothing
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame, Maker, with_halves
+from jscomb.methods import METHODS
 
-_means = jax.jit(nonlocal_means.denoise)
-_gaussian = jax.jit(smoothing.gaussian)
-
-BASES: dict[str, Callable[[Frame], Biased]] = {
-    "oidn": lambda frame: frame.biased.get("oidn") or oidn.denoise_frame(frame),
-    "oidn, no features": lambda frame: oidn.denoise_frame(frame, features=False),
-    "bilateral": bilateral.denoise_frame,
-    "gaussian": lambda frame: of_parts(
-        frame, lambda part: _gaussian(part.color), variance=False
-    ),
-    "non-local means": lambda frame: of_parts(
-        frame, lambda part: _means(part.color, part.color, part.variance)
-    ),
-    "rdfc": rdfc.denoise_frame,
-}
+BASES = "oidn", "oidn-color", "bilateral", "gaussian", "nonlocal-means", "rdfc"
 
 
-def bases_of(frame: Frame) -> dict[str, Biased]:
+def maker(name: str) -> Maker:
+    """A denoiser of the table of methods.
+
+    Args:
+        name: key of `METHODS`.
+
+    Returns:
+        the function from a normalised frame to its estimate.
+    """
+    return functools.partial(METHODS[name].estimate, jax.random.key(0))
+
+
+def bases_of(frame: Frame) -> dict[str, Estimate]:
     """The bases of a frame and of its halves, in the order of `BASES`.
 
     Args:
-        frame: with halves and variances; its own `oidn` is taken if it has one.
+        frame: normalised, with halves and variances; its own `oidn` is taken if it has
+            one.
 
     Returns:
-        the biased images, with halves.
+        the estimates, with halves.
     """
-    return {name: make(frame) for name, make in BASES.items()}
+    made = {name: maker(name) for name in BASES if name not in frame.estimates}
+    of = lambda name: frame.estimates.get(name) or made[name](frame)
+    return {name: of(name) for name in BASES}
 
 
-def unbiased_of(frame: Frame) -> Biased:
+def unbiased_of(frame: Frame) -> Estimate:
     """The unbiased image as one more base."""
-    return of_parts(frame, lambda part: part.color, variance=False)
+    return with_halves(frame, lambda part: part.color)

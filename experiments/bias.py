@@ -52,7 +52,7 @@ METHODS = (
     "bilateral",
     "james-stein",
 )
-_EPSILON = 0.01  # of the relative error, at an exposure of one
+_EPSILON = 0.01  # of the relative error, squared normalised radiance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Group(NamedTuple):
 def methods(
     guide: Frame, samples: int, window: int
 ) -> Callable[[Array, Array], dict[str, Image]]:
-    """All images of one realisation, and gamma, at an exposure of one.
+    """All images of one realisation, and gamma, of normalised radiance.
 
     Args:
         guide: a frame whose features guide the denoisers.
@@ -136,9 +136,7 @@ def methods(
         v = jnp.var(independent, axis=0, ddof=1) / len(independent)
         halves = [jnp.mean(i.reshape(2, 2, *i.shape[1:]), axis=1) for i in (y, z)]
         gamma, z_l2 = select(y, z, n), jax.vmap(with_gradients)(y, z)
-        denoised = oidn.denoise(
-            x, albedo=guide.albedo, normal=guide.normal, exposure=jnp.ones(())
-        )
+        denoised = oidn.denoise_normalised(x, albedo=guide.albedo, normal=guide.normal)
         return {
             "path tracing": x,
             "uniform": uniform(y, z),
@@ -197,14 +195,14 @@ def rendered_groups(config: Config, name: str, skip: int = 0) -> Iterator[Group]
         depth=np.float32(aov[..., 6:7]),
     )
     combined = jax.jit(methods(guide, config.samples, config.window))
-    exposure = float(guide.exposure)
+    unit = float(guide.median_luminance)
 
     def draws(launch: Callable, seeds: Iterator[int], count: int) -> Array:
         each = [
             launch(render.Pass("", config.samples, next(seeds), "path"))
             for _ in range(count)
         ]
-        return jnp.asarray(np.stack(each) / exposure, "float32")
+        return jnp.asarray(np.stack(each) / unit, "float32")
 
     for number in range(skip, config.groups):
         seeds = itertools.count(1 + number * 10**6)

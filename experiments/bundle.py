@@ -19,7 +19,7 @@ from jscomb import exr
 from jscomb.frame import Frame
 
 ROOT = pathlib.Path(__file__).parents[1]
-HALF = ("albedo", "normal", "depth", "visibility", "biased_halves", "half_difference")
+HALF = ("albedo", "normal", "depth", "visibility", "estimate_halves", "half_difference")
 # Top and left of each crop.
 CAUSTIC, BOX = (112, 96), (64, 40)  # under the glass sphere; the back of a box
 CROPS = {

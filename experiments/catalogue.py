@@ -14,7 +14,6 @@ from jax import lax
 
 from experiments.rendering import Rendering, bases, sub_averages
 from jscomb import (
-    choice,
     double_shrinkage,
     ensemble,
     james_stein,
@@ -30,9 +29,12 @@ from jscomb.denoisers import (
     rdfc,
     smoothing,
 )
-from jscomb.learning import methods, networks
+from jscomb.frame import Buffers, Estimate, Frame
+from jscomb.learning import networks
+from jscomb.methods import METHODS, Method
 from jscomb.numerics import poisson, regression, simplex, sure
 from jscomb.numerics.guards import finite, first_finite
+from jscomb.numerics.tiles import Local
 from jscomb.numerics.weights import noise_free_weights
 from jscomb.typing import Image, Scalar
 
@@ -59,8 +61,10 @@ class Entry(NamedTuple):
     multiple: int = 1
 
 
-def _at_one(function: Callable[[Rendering], Image]) -> Callable[[Rendering], Image]:
-    """At an exposure of one, where a constant counts as a squared radiance."""
+def _normalised(
+    function: Callable[[Rendering], Image],
+) -> Callable[[Rendering], Image]:
+    """Of normalised images, for a function with absolute constants."""
 
     def scaled(r: Rendering) -> Image:
         unit = lax.stop_gradient(r.unit)
@@ -159,22 +163,32 @@ def combiners() -> dict[str, Entry]:
     prior = lambda r: smoothing.box(r.biased, window=3)
     shrink = james_stein.combine
     return {
-        "james_stein.combine": Entry(lambda r: shrink(*xyv(r)), 14),
+        "james_stein.combine": Entry(lambda r: shrink(*xyv(r)), james_stein.reach()),
         "james_stein.combine whitened": Entry(
-            lambda r: shrink(*xyv(r), whiten=True), 14
+            lambda r: shrink(*xyv(r), whiten=True), james_stein.reach()
         ),
         "james_stein.combine corrected": Entry(
-            lambda r: shrink(*xyv(r), divergence=r.variance / 4), 14
+            lambda r: shrink(*xyv(r), divergence=r.variance / 4),
+            james_stein.reach(),
         ),
         "james_stein.combine_dual": Entry(
-            lambda r: james_stein.combine_dual(*halves(r), r.variance), 14
+            lambda r: james_stein.combine_dual(*halves(r), r.variance),
+            james_stein.reach(),
         ),
-        "james_stein.neural_combine": Entry(
-            lambda r: james_stein.neural_combine(
-                njs, r.unbiased, *halves(r)[2:], r.variance, exposure=r.unit
+        "james_stein.combine_inputs": Entry(
+            _normalised(
+                lambda r: james_stein.combine_inputs(
+                    njs,
+                    {
+                        "unbiased": r.unbiased,
+                        "biased_a": r.biased_a,
+                        "biased_b": r.biased_b,
+                        "variance": r.variance,
+                    },
+                )
             ),
-            methods._U_NET + 1 + 7 + 14,
-            multiple=methods._BLOCK,
+            max(njs.reach, 7) + james_stein.reach(window=7),
+            multiple=njs.multiple,
         ),
         "ensemble.combine": Entry(_ensemble, rounding=1e-4),
         "ensemble.combine multi-scale": Entry(
@@ -196,25 +210,61 @@ def combiners() -> dict[str, Entry]:
             ),
             1,
         ),
-        "double_shrinkage.neural_combine": Entry(
-            lambda r: double_shrinkage.neural_combine(
-                dsc, prior(r), *xyv(r)[:2], r.grey, r.grey / 4, exposure=r.unit
+        "double_shrinkage.combine_inputs": Entry(
+            _normalised(
+                lambda r: double_shrinkage.combine_inputs(
+                    dsc,
+                    {
+                        "prior": prior(r),
+                        "unbiased": r.unbiased,
+                        "biased": r.biased,
+                        "variance": r.grey,
+                        "mse": r.grey / 4,
+                    },
+                )
             ),
-            methods._U_NET + 6 + 1,
-            multiple=methods._BLOCK,
+            max(dsc.reach, 6) + 1,
+            multiple=dsc.multiple,
         ),
         "progressive.combine": Entry(lambda r: progressive.combine(*xyv(r), risk(r))),
-        "progressive.neural_combine": Entry(
-            lambda r: progressive.neural_combine(
-                pd, *xyv(r), risk(r), bound=False, exposure=r.unit
+        "progressive.combine_inputs": Entry(
+            _normalised(
+                lambda r: progressive.combine_inputs(
+                    pd,
+                    {
+                        "unbiased": r.unbiased,
+                        "biased": r.biased,
+                        "variance": r.variance,
+                        "sure": risk(r),
+                    },
+                )
             ),
-            7,
+            pd.reach,
         ),
         **{
-            f"choice.{name}": Entry(lambda r, method=method: method(*xyv(r)), 15)
-            for name, method in choice.UNTRAINED.items()
+            f"methods.plan {name}": Entry(
+                lambda r, method=method: _plan(r, method).whole(), _reach(method)
+            )
+            for name, method in METHODS.items()
+            # `denoised` returns its input; denoisers have entries of their own.
+            if method.pure and method.takes == "one estimate" and name != "denoised"
         },
     }
+
+
+def _plan(r: Rendering, method: Method) -> Local:
+    """What a method of one estimate makes of a rendering."""
+    color = jnp.stack([r.unbiased_a, r.unbiased_b])
+    variance = jnp.stack([r.variance, r.variance]) * 2
+    frame = Frame(Buffers(color, variance), None, {}, None, r.unit)
+    assert method.plan is not None
+    return method.plan(jax.random.key(0), frame, Estimate(r.biased))
+
+
+def _reach(method: Method) -> int | None:
+    """How far a method sees."""
+    image = jnp.ones((1, 1, 3), jnp.float32)
+    return _plan(Rendering(*6 * [image], jnp.ones(())), method).halo
 
 
 def denoisers(*, window: int | None = None) -> dict[str, Entry]:
@@ -239,13 +289,15 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
             lambda r: bilateral.denoise(
                 r.unbiased, r.variance, r.features, window=near
             ),
-            near // 2 + 1,
+            bilateral.reach(window=near),
         ),
         "nonlocal_means.denoise": Entry(
-            lambda r: nonlocal_means.denoise(*guided(r), window=near), near // 2 + 3
+            lambda r: nonlocal_means.denoise(*guided(r), window=near),
+            nonlocal_means.reach(window=near),
         ),
         "rdfc.denoise": Entry(
-            lambda r: rdfc.denoise(*guided(r), r.features, window=near), near // 2 + 3
+            lambda r: rdfc.denoise(*guided(r), r.features, window=near),
+            rdfc.reach(window=near),
         ),
         "nfor.denoise": Entry(
             lambda r: jnp.concatenate(
@@ -258,17 +310,21 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
                 axis=-1,
             )
         ),
-        "smoothing.gaussian": Entry(lambda r: smoothing.gaussian(r.unbiased), 8),
+        "smoothing.gaussian": Entry(
+            lambda r: smoothing.gaussian(r.unbiased), smoothing.reach()
+        ),
         "smoothing.box": Entry(lambda r: smoothing.box(r.unbiased), 3),
-        "kernel_predicting.denoise": Entry(
-            lambda r: kernel_predicting.denoise(
-                network, r.unbiased, r.variance, seven(r), exposure=r.unit
+        "kernel_predicting.denoise_normalised": Entry(
+            _normalised(
+                lambda r: kernel_predicting.denoise_normalised(
+                    network, r.unbiased, r.variance, seven(r)
+                )
             ),
-            methods._U_NET + 1 + 5,
-            multiple=methods._BLOCK,
+            max(network.reach, 5),
+            multiple=network.multiple,
         ),
         "james_stein.cross_regression": Entry(
-            _at_one(
+            _normalised(
                 lambda r: jnp.concatenate(
                     james_stein.cross_regression(
                         *r[:4], r.features, r.features, kappa=0.01, window=wide
@@ -279,7 +335,7 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
             far,
         ),
         "double_shrinkage.radiance_prior": Entry(
-            _at_one(
+            _normalised(
                 lambda r: first_finite(
                     double_shrinkage.radiance_prior(
                         *guided(r)[:2], r.grey, r.grey / 4, r.features, window=wide
@@ -289,7 +345,7 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
             far,
         ),
         "double_shrinkage.blend_prior": Entry(
-            _at_one(
+            _normalised(
                 lambda r: first_finite(
                     double_shrinkage.blend_prior(
                         r.biased, r.grey, r.features, window=wide
@@ -301,7 +357,8 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
     }
     if oidn.available():
         found["oidn.denoise"] = Entry(
-            lambda r: oidn.denoise(r.unbiased, exposure=r.unit), backwards=False
+            lambda r: oidn.denoise(r.unbiased),
+            backwards=False,
         )
     return found
 
@@ -349,7 +406,7 @@ def solvers(*, window: int | None = None) -> dict[str, Entry]:
         ),
         "ensemble.solve_weights": Entry(_by(ensemble.solve_weights), 1),
         "poisson.reconstruct": Entry(_poisson),
-        "regression.local_linear": Entry(_at_one(regressed), far),
-        "regression.joint_local_linear": Entry(_at_one(jointly), far),
+        "regression.local_linear": Entry(_normalised(regressed), far),
+        "regression.joint_local_linear": Entry(_normalised(jointly), far),
         "sure.monte_carlo_sure": Entry(_sure, degree=2),
     }

@@ -3,8 +3,8 @@
     python -m experiments.choice FOLDER --results FILE.json
 
 Every archive in the folder (see `frames`), at every sample count: what
-`jscomb.choose` takes, and the error (relative L2, less the reference's noise) of every
-method. The regret is the chosen method's error divided by the least of all.
+`jscomb.methods.choose` takes, and the error (relative L2, less the reference's noise)
+of every method. The regret is the chosen method's error divided by the least of all.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ import numpy as np
 import tyro
 
 from experiments import frames
-from jscomb import choice
 from jscomb.frame import Frame
+from jscomb.methods import CANDIDATES, choose, combine
 from jscomb.metrics import rel_l2
 
 
@@ -39,7 +39,7 @@ def measure(frame: Frame, *, methods: tuple[str, ...]) -> dict[str, float]:
     """Errors of all methods, which of them was chosen, and what it cost to choose.
 
     Args:
-        frame: with halves, `oidn` and a reference, at an exposure of one.
+        frame: normalised, with halves, `oidn` and a reference.
         methods: to choose from.
 
     Returns:
@@ -48,11 +48,12 @@ def measure(frame: Frame, *, methods: tuple[str, ...]) -> dict[str, float]:
     """
     assert frame.reference is not None
     r, noise = frame.reference
-    found = choice.choose(frame, name="oidn", methods=methods)
+    key = jax.random.key(0)
+    found = choose(key, frame, biased="oidn", methods=methods)
     errors = {}
     for method in methods:
-        image = choice.combine(jax.random.key(0), frame, "oidn", method=method)
-        errors[method] = float(rel_l2(image, r, half_difference=noise))
+        made = combine(key, frame, method=method, biased="oidn")
+        errors[method] = float(rel_l2(made.image, r, half_difference=noise))
     errors |= {f"{t.method} s": t.seconds for t in found.trials if t.change}
     return errors | {"chosen": float(methods.index(found.method))}
 
@@ -69,7 +70,7 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: if the folder holds no archive.
     """
-    methods = choice.CANDIDATES[: 2 if config.quick else None]
+    methods = CANDIDATES[: 2 if config.quick else None]
 
     def all_of(frame: Frame) -> dict[str, float]:
         return measure(frame, methods=methods)
@@ -88,7 +89,7 @@ def ratios(rows: dict[str, dict[str, float]]) -> dict[str, np.ndarray]:
     Returns:
         ratios frame by frame, by method; "chosen" last.
     """
-    methods = [m for m in choice.CANDIDATES if m in next(iter(rows.values()))]
+    methods = [m for m in CANDIDATES if m in next(iter(rows.values()))]
     errors = np.array([[row[m] for m in methods] for row in rows.values()])
     chosen = np.array([int(row["chosen"]) for row in rows.values()])
     least = errors.min(axis=1)

@@ -14,16 +14,16 @@ import dataclasses
 import pathlib
 import sys
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
 from experiments import sweep
-from experiments.combiners import COMBINERS
+from experiments.combiners import combiners
 from experiments.sweep import Record
-from jscomb.denoisers import of_parts, smoothing
-from jscomb.frame import Frame
+from jscomb.denoisers import smoothing
+from jscomb.frame import Frame, with_halves
+from jscomb.numerics.tiles import compiled
 
 BOX = 15  # pixels
 
@@ -59,11 +59,8 @@ def blurred(frame: Frame) -> Frame:
     Returns:
         the same frame otherwise.
     """
-    box = of_parts(frame, lambda part: _box(part.color), variance=False)
-    return frame.with_biased("oidn", box)
-
-
-_box = jax.jit(lambda image: smoothing.box(image, window=BOX))
+    box = compiled(smoothing.box, window=BOX)
+    return frame.with_estimate("oidn", with_halves(frame, lambda part: box(part.color)))
 
 
 def measure_blurred(config: Config) -> None:
@@ -74,9 +71,9 @@ def measure_blurred(config: Config) -> None:
     """
     assert config.biased is not None
     swept = sweep.Config(config.biased, config.results, quick=config.quick)
-    names = tuple(n for n in swept.combiners if COMBINERS[n].traced or n == "njs")
+    names = tuple(n for n in swept.combiners if combiners()[n].traced or n == "njs")
     if config.quick:
-        names = ("path tracing", "oidn", "whitened 7x7")
+        names = ("path tracing", "oidn", "whitened")
     swept = dataclasses.replace(swept, combiners=names)
     sweep.run(
         swept,

@@ -5,14 +5,14 @@
 Every frame is an EXR file by `experiments.render`: two half buffers with variances
 and features, Open Image Denoise of the frame and of its halves, and a reference. The
 sample counts of a scene are drawn from powers of two between 4 and 256 and its frames
-share one reference; their noise is independent of it and of each other. A run that was
-interrupted goes on where it was, and one with more scenes adds to those that are there.
+share one reference; their noise is independent of it and of each other. The same
+command resumes an interrupted run, and with more scenes adds to the existing ones.
 
-A reference of 1024 samples is itself noisy, which a squared error forgives: with a
-reference r + e, E[e] = 0 and independent of the inputs, the expected loss is that of r
-plus the variance of e, whatever the network puts out, so its gradient is unbiased.
-Not so for absolute errors, nor for the weights that a relative error takes from r: both
-bend it a little, the less the more samples the reference has.
+A reference of 1024 samples is itself noisy, which does not matter to a squared error:
+with a reference r + e, E[e] = 0 and e independent of the inputs, the expected loss is
+that of r plus the variance of e, whatever the network's output, so its gradient is
+unbiased. It is slightly biased for absolute errors, and by the weights that a relative
+error takes from r; less so with more samples.
 """
 
 import concurrent.futures
@@ -32,7 +32,7 @@ from jscomb.denoisers import oidn
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 SCENES_A_PROCESS = 10
-STREAMS = 100_000  # apart from each other: seeds of the frames of one scene
+STREAMS = 100_000  # difference of the seeds of one scene's frames
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Config:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Reject what cannot be drawn."""
+        """Raise for options out of range."""
         if not 1 <= self.counts <= len(COUNTS):
             raise ValueError(f"counts must be 1 to {len(COUNTS)}, got {self.counts}")
         if self.scenes < 1 or self.reference_spp < 1024:
@@ -67,14 +67,14 @@ class Config:
 
 
 def renders(config: Config, scene: int) -> Iterator[render.Config]:
-    """What to render of one scene; the first has the reference, the others borrow it.
+    """Return what to render of one scene; the first frame's reference is shared.
 
     Args:
         config: which frames.
         scene: seed of the scene.
 
     Yields:
-        a frame each, by falling sample count.
+        one frame each, most samples first.
     """
     rng = np.random.default_rng([scene, 0xC0417])
     counts = sorted(rng.choice(COUNTS, config.counts, replace=False), reverse=True)
@@ -94,7 +94,7 @@ def renders(config: Config, scene: int) -> Iterator[render.Config]:
 
 
 def run(config: Config) -> list[pathlib.Path]:
-    """Render the frames that are not there yet.
+    """Render the frames that do not exist yet.
 
     Args:
         config: which frames.
@@ -104,7 +104,7 @@ def run(config: Config) -> list[pathlib.Path]:
 
     Raises:
         ImportError: without Open Image Denoise.
-        RuntimeError: if the renderer crashed; the same command goes on.
+        RuntimeError: if the renderer crashed; the same command resumes.
     """
     if not oidn.available():
         raise ImportError('a dataset needs a denoiser: pip install "jscomb[oidn]"')
@@ -112,8 +112,8 @@ def run(config: Config) -> list[pathlib.Path]:
     start, seeds = time.monotonic(), range(config.seed, config.seed + config.scenes)
     every = {seed: list(renders(config, seed)) for seed in seeds}
     todo = {s: [f for f in fs if not f.out.exists()] for s, fs in every.items()}
-    # A process a few scenes: Dr.Jit keeps every scene's compiled code, and was seen to
-    # crash after some ninety.
+    # One process for a few scenes: Dr.Jit keeps every scene's compiled code, and was
+    # observed to crash after about ninety.
     with concurrent.futures.ProcessPoolExecutor(
         max_workers=1,
         mp_context=multiprocessing.get_context("spawn"),
@@ -130,7 +130,7 @@ def run(config: Config) -> list[pathlib.Path]:
 
 
 def _render_all(frames: list[render.Config]) -> int:
-    """Render frames; how many."""
+    """Render frames, and return how many."""
     for frame in frames:
         render.run(frame)
     return len(frames)

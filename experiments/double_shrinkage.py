@@ -126,55 +126,53 @@ def frames(config: Config, scene: str, kept: dict) -> tuple[Frame, Frame, Image]
     kept |= {"spp": counts[0], "passes": counts[1]}
     radii = [photon_mapping.radius_of(1.0, k) for k in range(number)]
     radii = jnp.asarray(radii, mean.dtype)
-    photons = exr.read_frame(half.out).biased[PHOTONS].full
+    photons = exr.read_frame(half.out).estimates[PHOTONS].image
     bias = double_shrinkage.radius_bias(photons, mean, radii)
     return exr.read_frame(whole.out), exr.read_frame(half.out), bias
 
 
 def methods(whole: Frame, half: Frame) -> dict[str, Callable[[], Image]]:
     """All images by name; those of half the time unless they say alone."""
-    u, b = half.color, half.biased[PHOTONS]
+    u, b = half.color, half.estimates[PHOTONS]
     v = james_stein.robust_variance(half.variance)
     x_a, x_b = (part.color for part in half.halves())
-    made = lambda: double_shrinkage.combine_frame(half, PHOTONS)
+    inputs = lambda: double_shrinkage.make_inputs(half, b)
 
     def blend() -> Image:
-        found = made()
+        found = inputs()
         nothing = jnp.zeros_like(found.mse)
         shares = double_shrinkage.factors(found.variance, found.mse, nothing)
-        return shares.blend(u, b.full)
+        return shares.blend(u, b.image)
 
     def of_bases() -> Image:
         bases = [
             jnp.stack([i, j])
-            for i, j in zip((b.full, *b.halves), (u, x_a, x_b), strict=True)
+            for i, j in zip((b.image, *b.halves), (u, x_a, x_b), strict=True)
         ]
         return _ensemble(*bases, x_a, x_b)
 
-    def denoised() -> Frame:
-        return whole.with_biased("oidn", oidn.denoise_frame(whole))
-
+    denoised = lambda: oidn.denoise_frame(whole)
     return {
         "path tracing alone": lambda: whole.color,
-        "photon mapping alone": lambda: whole.biased[PHOTONS].full,
-        "their mean": lambda: (u + b.full) / 2,
+        "photon mapping alone": lambda: whole.estimates[PHOTONS].image,
+        "their mean": lambda: (u + b.image) / 2,
         "inverse error (k1)": blend,
         "james-stein": lambda: _james_stein(
-            u, b.full, james_stein.smooth_variance(half.variance)
+            u, b.image, james_stein.smooth_variance(half.variance)
         ),
-        "james-stein, whitened": lambda: _james_stein(u, b.full, v, **WHITENED),
+        "james-stein, whitened": lambda: _james_stein(u, b.image, v, **WHITENED),
         "ensemble, multi-scale": of_bases,
-        "prior": lambda: made().prior,
-        "double shrinkage": lambda: made().image,
-        "path tracing alone, oidn": lambda: denoised().biased["oidn"].full,
+        "prior": lambda: inputs().prior,
+        "double shrinkage": lambda: double_shrinkage.combine_frame(half, b).image,
+        "path tracing alone, oidn": lambda: denoised().image,
         "path tracing alone, oidn, james-stein": lambda: _james_stein(
             whole.color,
-            whole.biased["oidn"].full,
+            whole.estimates["oidn"].image,
             james_stein.robust_variance(whole.variance),
             **WHITENED,
         ),
         "path tracing alone, oidn, double shrinkage": lambda: (
-            double_shrinkage.combine_frame(denoised(), "oidn").image
+            double_shrinkage.combine_frame(whole, denoised()).image
         ),
     }
 
@@ -188,28 +186,29 @@ _ensemble = jax.jit(
 
 def ablations(half: Frame) -> dict[str, Image]:
     """Figures 14 and 15: the prior swapped for y*, and the combiner for James-Stein."""
-    found = double_shrinkage.combine_frame(half, PHOTONS)
-    u, b = half.color, half.biased[PHOTONS]
+    u, b = half.color, half.estimates[PHOTONS]
+    found = double_shrinkage.make_inputs(half, b)
     v = james_stein.robust_variance(half.variance)
-    exposure = half.exposure
     a_frame, b_frame = half.halves()
     halves = jax.jit(james_stein.cross_regression, static_argnames="stride")(
-        *(i / exposure for i in (a_frame.color, b_frame.color, *b.halves)),
+        a_frame.color,
+        b_frame.color,
+        *b.halves,
         stack(a_frame),
         stack(b_frame),
         stride=2,
     )
-    star = exposure * (halves[0] + halves[1]) / 2
+    star = (halves[0] + halves[1]) / 2
     w, m = found.variance, found.mse
 
     def towards(prior: Image) -> Image:
-        eta = double_shrinkage.confidence(prior, u, b.full, w, m)
-        return double_shrinkage.combine(prior, u, b.full, w, m, eta)
+        eta = double_shrinkage.confidence(prior, u, b.image, w, m)
+        return double_shrinkage.combine(prior, u, b.image, w, m, eta)
 
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
-    paper = _prior(u, b.full, one(w), one(m), stack(half), stride=2)
+    paper = _prior(u, b.image, one(w), one(m), stack(half), stride=2)
     return {
-        "double shrinkage": found.image,
+        "double shrinkage": double_shrinkage.combine_frame(half, b).image,
         "its prior alone": found.prior,
         "the paper's prior alone": paper,
         "double shrinkage to the paper's prior": towards(paper),
@@ -230,18 +229,18 @@ def errors_of_photons(half: Frame, bias: Image) -> dict[str, list[float]]:
     """Estimated and true mean squared error, relative: frame, dark and bright."""
     assert half.reference is not None
     r, noise = half.reference
-    b = half.biased[PHOTONS]
+    b = half.estimates[PHOTONS]
     x_a, x_b = (part.color for part in half.halves())
     variance = jnp.square(b.halves[0] - b.halves[1]) / 4
     own = 0 if noise is None else jnp.square(noise) / 4
     each = {
-        "true": jnp.square(b.full - r) - own,
+        "true": jnp.square(b.image - r) - own,
         "by halves": double_shrinkage.biased_error(x_a, x_b, *b.halves),
         "by radii": bias + variance,
         "variance alone": variance,
     }
     level = np.asarray(r).mean(axis=-1, keepdims=True)
-    weight = 1 / (level**2 + 0.01 * float(half.exposure) ** 2)
+    weight = 1 / (level**2 + 0.01)
     dark, bright = np.quantile(level, [0.25, 0.75])
     parts = np.ones_like(level), level < dark, level > bright
     return {
@@ -272,8 +271,8 @@ def run(config: Config) -> dict[str, dict]:
         row = kept.setdefault(scene, {})
         whole, half, bias = frames(config, scene, row)
         results.write_text(json.dumps(kept, indent=1))
-        scale = 1 / whole.exposure
-        whole, half, bias = whole.scaled(scale), half.scaled(scale), bias * scale**2
+        whole = whole.normalised()
+        half, bias = half.normalised(whole.unit), bias / whole.unit**2
         error = functools.partial(error_of, whole.reference)
         images, row["error"], row["seconds"] = {}, {}, {}
         for name, make in methods(whole, half).items():
@@ -291,7 +290,8 @@ def run(config: Config) -> dict[str, dict]:
 
 def _picture(path: pathlib.Path, whole: Frame, half: Frame, images: dict) -> None:
     """The images, and what share the biased image and the prior have."""
-    found = double_shrinkage.combine_frame(half, PHOTONS)
+    found = double_shrinkage.make_inputs(half, half.estimates[PHOTONS])
+    share = double_shrinkage.factors(found.variance, found.mse, found.confidence)
     shown = {
         "reference": whole.reference.image,
         "path tracing, all the time": images["path tracing alone"],
@@ -304,10 +304,10 @@ def _picture(path: pathlib.Path, whole: Frame, half: Frame, images: dict) -> Non
     for axis, (name, image) in zip(axes.flat, shown.items(), strict=False):
         axis.imshow(np.asarray(tone_map(image)), interpolation="nearest")
         axis.set_title(name, fontsize=9)
-    shares = (("share of photons, k1", found.biased_share),
-              ("share of the prior, k2 (red)", found.prior_share))  # fmt: skip
-    for axis, (name, share) in zip(axes.flat[6:], shares, strict=True):
-        axis.imshow(np.mean(share, axis=-1), cmap="coolwarm", vmin=0, vmax=1)
+    shares = (("share of photons, k1", share.biased),
+              ("share of the prior, k2 (red)", share.prior))  # fmt: skip
+    for axis, (name, image) in zip(axes.flat[6:], shares, strict=True):
+        axis.imshow(np.mean(image, axis=-1), cmap="coolwarm", vmin=0, vmax=1)
         axis.set_title(name, fontsize=9)
     for axis in axes.flat:
         axis.axis("off")

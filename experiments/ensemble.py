@@ -4,7 +4,7 @@
 
 Every archive in the folder (see `frames`), at every sample count. Bases: Open Image
 Denoise with and without features, joint bilateral, Gaussian, non-local means and RDFC;
-and the unbiased image. Relative L2, less the reference's noise, at an exposure of 1,
+and the unbiased image. Relative L2, less the reference's noise, of normalised frames,
 divided by that of the best base, and time: of the plain average, of one-hot choices, of
 weights from single pixels, windows, the frame and all scales, filtered or not, with
 each channel by itself, of either sign, and with the unbiased image among the bases.
@@ -179,9 +179,9 @@ def measure(frame: Frame) -> dict[str, float]:
     rest = x_a, x_b, frame.variance, frame.albedo, frame.normal
     bases = bases_of(frame)
     row = {"path tracing": error(frame.color)}
-    row |= {name: error(base.full) for name, base in bases.items()}
-    some = ensemble.stack_bases(bases)
-    more = ensemble.stack_bases(bases | {"x": unbiased_of(frame)})
+    row |= {name: error(base.image) for name, base in bases.items()}
+    some = ensemble.stack_estimates(bases)
+    more = ensemble.stack_estimates(bases | {"x": unbiased_of(frame)})
 
     def add(name: str, method: Callable, images: Sequence[Image]) -> None:
         call = functools.partial(method, *images, *rest)
@@ -195,11 +195,11 @@ def measure(frame: Frame) -> dict[str, float]:
     ours, names = METHODS["multi-scale"], list(BASES)
     for count in range(2, len(names)):
         for subset in itertools.combinations(names, count):
-            images = ensemble.stack_bases({name: bases[name] for name in subset})
+            images = ensemble.stack_estimates({name: bases[name] for name in subset})
             row[" + ".join(subset)] = error(ours(*images, *rest))
     chosen = ensemble.select_bases(some.biased_a, some.biased_b, x_a, x_b).kept
     needed = {names[k]: bases[names[k]] for k in chosen}
-    add("selected", ours, ensemble.stack_bases(needed))
+    add("selected", ours, ensemble.stack_estimates(needed))
     row["selected, number"] = len(chosen)
     return row
 

@@ -28,7 +28,8 @@ from experiments import frames
 from experiments.bases import bases_of, unbiased_of
 from experiments.timing import medians
 from jscomb import ensemble
-from jscomb.denoisers import of_parts, smoothing
+from jscomb.denoisers import smoothing
+from jscomb.frame import with_halves
 from jscomb.numerics import simplex
 
 STEPS = 64, 256, 1024, 4096
@@ -81,10 +82,10 @@ def repeated(images: jax.Array, size: int) -> jax.Array:
 def problems(config: Config, size: int) -> list[jax.Array]:
     """y^a and y^b [8,size,size,3], x_a and x_b [size,size,3]."""
     frame = frames.load(config.folder / f"{config.frame}.npz", config.samples)
-    frame = frame.scaled(1 / frame.exposure)
-    box = of_parts(frame, lambda part: smoothing.box(part.color), variance=False)
+    frame = frame.normalised()
+    box = with_halves(frame, lambda part: smoothing.box(part.color))
     more = {"x": unbiased_of(frame), "box": box}
-    _, a, b = ensemble.stack_bases(bases_of(frame) | more)
+    _, a, b = ensemble.stack_estimates(bases_of(frame) | more)
     x = jnp.stack([half.color for half in frame.halves()])
     a, b, (x_a, x_b) = (repeated(images, size) for images in (a, b, x))
     return [a, b, x_a, x_b]

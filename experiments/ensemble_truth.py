@@ -70,7 +70,7 @@ def renderings_of(frame: Frame) -> list[Frame]:
         mine = slice(2 * number, 2 * number + 2)
         buffers = (b if b is None or len(b) == 1 else b[mine] for b in frame.buffers)
         samples = None if frame.samples is None else frame.samples / count
-        return Frame(Buffers(*buffers), samples, {}, None)
+        return Frame(Buffers(*buffers), samples, {}, None, unit=frame.unit)
 
     return [rendering(number) for number in range(count)]
 
@@ -118,13 +118,13 @@ def true_weights(full, a, b, x_a, x_b, truth):
 def measure(config: Config, scene: str) -> dict[str, float]:
     """Relative L2 by method, mean over the judged renderings."""
     frame = rendered(config, scene)
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.normalised()
     assert frame.reference is not None
     truth, noise = frame.reference
     every = renderings_of(frame)
     bases, unbiased = [], []
     for rendering in tqdm(every, unit="rendering", desc=scene):
-        bases.append(ensemble.stack_bases(bases_of(rendering)))
+        bases.append(ensemble.stack_estimates(bases_of(rendering)))
         unbiased.append([half.color for half in rendering.halves()])
     full, a, b = (jnp.stack(i) for i in zip(*bases, strict=True))
     x_a, x_b = (jnp.stack(i) for i in zip(*unbiased, strict=True))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jscomb.frame import CHANNELS, Biased, Frame, Reference, make_frame
+from jscomb.frame import CHANNELS, Estimate, Frame, Reference, make_frame
 
 
 def load(path: pathlib.Path, samples: int) -> Frame:
@@ -47,8 +47,8 @@ def load(path: pathlib.Path, samples: int) -> Frame:
             pair(f"color_{half}"),
             variance=pair(f"variance_{half}"),
             samples=samples,
-            biased={
-                "oidn": Biased(
+            estimates={
+                "oidn": Estimate(
                     jnp.asarray(data[f"full_oidn_{half}"]),
                     jnp.asarray(pair(f"oidn_{half}")),
                 )
@@ -97,7 +97,7 @@ def measured(
     results: pathlib.Path | None = None,
     quick: bool = False,
 ) -> dict[str, dict[str, float]]:
-    """Measure all frames of a folder, each brought to an exposure of one.
+    """Measure all frames of a folder, normalised.
 
     Args:
         folder: of archives.
@@ -121,8 +121,7 @@ def measured(
         missing = {name: kind for name, kind in names.items() if name not in found}
         if not missing:
             continue
-        frame = load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = load(path, samples).normalised()
         for name, kind in missing.items():
             found[name] = measures[kind](frame)
             if results is not None:

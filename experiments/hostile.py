@@ -1,7 +1,7 @@
-"""EXR files that are damaged, hostile or unusual: the corpus of `attack`.
+"""Make EXR files that are damaged, hostile or unusual: the corpus of `attack`.
 
-Where a kind of damage is of bytes, each file is one good file with one change. What
-OpenEXR's Python binding does not write comes from `assembled`.
+Each damaged file is one good file with one change. What OpenEXR's Python binding cannot
+write comes from `assembled`.
 """
 
 import io
@@ -17,15 +17,15 @@ import OpenEXR
 
 from experiments import assembled
 from jscomb import exr
-from jscomb.exr import own
-from jscomb.exr.files import Part, read_parts, write_parts
+from jscomb.exr import native
+from jscomb.exr._files import Part, read_parts, write_parts
 from jscomb.frame import Frame, make_frame
 
 SIZE = 24, 20  # height and width in pixels
 OURS, THEIRS = "jscomb's own file", "another program's file"
 
 
-Arrays = dict[str, np.ndarray]  # of a frame, by their place in it
+Arrays = dict[str, np.ndarray]  # of a frame, by their paths in it
 
 
 class Case(NamedTuple):
@@ -35,86 +35,56 @@ class Case(NamedTuple):
         kind: what is special about it.
         data: its bytes.
         right: arrays of the frame in it; None if only an error is right.
-        told: whether a checksum in the file tells of any change to it.
-        tolerance: of a lossy codec, relative to 1.
+        has_checksum: a checksum in the file covers the change.
+        tolerance: of a lossy codec, absolute.
     """
 
     kind: str
     data: bytes
     right: Arrays | None
-    told: bool = True
+    has_checksum: bool = True
     tolerance: float = 0.0
 
 
 def image(seed: int, *shape: int) -> np.ndarray:
-    """Noise.
-
-    Args:
-        seed: of the noise.
-        shape: of the image.
-
-    Returns:
-        the image, uniform in [0, 1), float32.
-    """
+    """Return uniform noise in [0, 1), float32."""
     return np.random.default_rng(seed).random(shape, np.float32)
 
 
 def own_frame(seed: int) -> Frame:
-    """A frame with some of everything, so that the file has several parts.
-
-    Args:
-        seed: of its noise.
-
-    Returns:
-        the frame.
-    """
+    """Return a noisy frame with most kinds of buffers, for a file of several parts."""
     return make_frame(
         image(seed, 2, *SIZE, 3),
         variance=image(seed + 1, 2, *SIZE, 3),
         albedo=np.ones((*SIZE, 3), np.float32),
         depth=image(seed + 2, *SIZE, 1),
         samples=64,
-        biased={"oidn": np.zeros((*SIZE, 3), np.float32)},
+        estimates={"oidn": np.zeros((*SIZE, 3), np.float32)},
     )
 
 
 def arrays(frame: Frame) -> Arrays:
-    """A frame as it is compared.
-
-    Args:
-        frame: any.
-
-    Returns:
-        its arrays.
-    """
+    """Return the arrays of a frame, to compare."""
     leaves = jax.tree_util.tree_leaves_with_path(frame)
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def own_bytes(frame: Frame, folder: pathlib.Path) -> bytes:
-    """A frame's file.
-
-    Args:
-        frame: to write.
-        folder: for a file in between.
-
-    Returns:
-        its bytes.
-    """
+    """Return the bytes of a frame's file, written in `folder`."""
     exr.write_frame(folder / "own.exr", frame, provenance={"seed": 2**40})
     return (folder / "own.exr").read_bytes()
 
 
 def corpus(folder: pathlib.Path, *, seed: int, step: int) -> Iterator[Case]:
-    """All files.
+    """Yield all files, kind by kind.
 
     Args:
-        folder: for files in between.
+        folder: for temporary files.
         seed: of the noise.
-        step: only every so many bytes of each file are damaged.
+        step: bytes from one damage to the next.
 
     Yields:
-        the cases, kind by kind.
+        the cases.
     """
     frame = own_frame(seed)
     ours = Case("as jscomb writes it", own_bytes(frame, folder), arrays(frame))
@@ -122,7 +92,7 @@ def corpus(folder: pathlib.Path, *, seed: int, step: int) -> Iterator[Case]:
     yield from _damaged(OURS, ours, step)
     yield from _changed_parts(ours, folder)
     smooth = np.linspace(0, 1, math.prod(SIZE) * 3, dtype=np.float32)
-    color = np.round(smooth, 2).reshape(*SIZE, 3)  # so that every chunk shrinks
+    color = np.round(smooth, 2).reshape(*SIZE, 3)  # every chunk compresses
     for case in _whole(color, image(seed, *SIZE, 3)):
         yield case._replace(kind=f"{THEIRS}, every compression")
         if case.kind in DAMAGED:
@@ -133,7 +103,7 @@ def corpus(folder: pathlib.Path, *, seed: int, step: int) -> Iterator[Case]:
         yield Case(f"claims of {claim}", data, black)
 
 
-# By the largest difference that the codec may make to numbers in [0, 1].
+# The largest error of each codec for numbers in [0, 1].
 CODECS = {
     "NO": 0.0,
     "RLE": 0.0,
@@ -157,7 +127,7 @@ DAMAGED = (
 
 
 def _whole(color: np.ndarray, noise: np.ndarray) -> Iterator[Case]:
-    """Files as they should be; ZIP has a checksum, but leaves noise as it is."""
+    """Yield intact files; ZIP has a checksum, but not for noise, which is stored."""
     codec = lambda name: getattr(OpenEXR, f"{name}_COMPRESSION")
     plain, half = _of(color), color.astype(np.float16)
     for name, tolerance in CODECS.items():
@@ -174,18 +144,18 @@ def _whole(color: np.ndarray, noise: np.ndarray) -> Iterator[Case]:
 
 
 def _of(color: np.ndarray) -> Arrays:
-    """What a file of colour alone is read as."""
+    """Return what a file of colour alone is read as."""
     return arrays(make_frame(color))
 
 
 def _foreign(color: np.ndarray, **header: Any) -> bytes:
-    """An RGB file as the binding writes it."""
+    """Return an RGB file as the binding writes it."""
     channels = {n: np.ascontiguousarray(color[..., c]) for c, n in enumerate("RGB")}
     return _written(channels, header)
 
 
 def _written(channels: dict[str, np.ndarray], header: dict[str, Any]) -> bytes:
-    """A file of any channels as the binding writes it."""
+    """Return a file of any channels as the binding writes it."""
     usual = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     stream = io.BytesIO()
     OpenEXR.File(usual | header, channels).write(stream)
@@ -193,11 +163,11 @@ def _written(channels: dict[str, np.ndarray], header: dict[str, Any]) -> bytes:
 
 
 def _damaged(whose: str, case: Case, step: int) -> Iterator[Case]:
-    """A file cut off, with a bit flipped, with four bytes overwritten."""
+    """Yield a file truncated, with a bit flipped, with four bytes overwritten."""
     data = case.data
     for end in range(0, len(data), max(step // 2, 1)):
         truncated = f"{whose}, truncated"
-        yield case._replace(kind=truncated, data=data[:end], told=True)
+        yield case._replace(kind=truncated, data=data[:end], has_checksum=True)
     codec = "" if whose == OURS else f", {case.kind}"
     random = np.random.default_rng(len(data))
     start = header_size(data)
@@ -208,21 +178,14 @@ def _damaged(whose: str, case: Case, step: int) -> Iterator[Case]:
         else:
             damaged[place] ^= 1 << number // 2 % 8
         if place < start:
-            kind, told = f"{whose}, header damaged", whose == OURS
+            kind, checked = f"{whose}, header damaged", whose == OURS
         else:
-            kind, told = f"{whose}{codec}, pixels damaged", case.told
-        yield case._replace(kind=kind, data=bytes(damaged), told=told)
+            kind, checked = f"{whose}{codec}, pixels damaged", case.has_checksum
+        yield case._replace(kind=kind, data=bytes(damaged), has_checksum=checked)
 
 
 def header_size(data: bytes) -> int:
-    """Where the pixels of a file begin.
-
-    Args:
-        data: the file.
-
-    Returns:
-        the number of bytes of all headers and the tables of offsets.
-    """
+    """Return the bytes of all headers and tables of offsets of a file."""
     multi_part, place, chunks = data[5] & 0x10, 8, 0
     while data[place]:
         while data[place]:
@@ -242,7 +205,7 @@ def header_size(data: bytes) -> int:
 
 
 def _changed_parts(ours: Case, folder: pathlib.Path) -> Iterator[Case]:
-    """Files of ours with other parts than they were written with."""
+    """Yield our own files with parts removed, added or exchanged."""
     path = folder / "parts.exr"
     path.write_bytes(ours.data)
     parts = read_parts(str(path))
@@ -261,17 +224,21 @@ def _changed_parts(ours: Case, folder: pathlib.Path) -> Iterator[Case]:
     ):
         bare = [Part(p.name, p.channels, _ours(p.attributes)) for p in some]
         write_parts(str(path), bare)
-        held = ours.right if some is reordered else None
-        yield Case("parts removed, added, exchanged", path.read_bytes(), held)
+        right = ours.right if some is reordered else None
+        yield Case("parts removed, added, exchanged", path.read_bytes(), right)
 
 
 def _ours(attributes: dict[str, Any]) -> dict[str, Any]:
-    """The attributes that make a file ours."""
-    return {k: v for k, v in attributes.items() if k in (own.ATTRIBUTE, own.PROVENANCE)}
+    """Return the attributes that identify our own files."""
+    return {
+        k: v
+        for k, v in attributes.items()
+        if k in (native.ATTRIBUTE, native.PROVENANCE)
+    }
 
 
 def _unusual(color: np.ndarray) -> Iterator[Case]:
-    """Files in order, but such as few programs write."""
+    """Yield valid files of kinds that few programs write."""
     height, width = SIZE
     types = {"R": np.float16, "G": np.float32, "B": np.uint32}
     whole = np.round(100 * color)

@@ -2,10 +2,10 @@
 
     python -m experiments.james_stein_error FOLDER
 
-Every archive in the folder (see `frames`), at every sample count: relative L2 at an
-exposure of one, less the reference's noise, of path tracing, of Open Image Denoise, and
-of each combiner (`auto` combines only where the half buffers say that it helps); then
-the geometric mean over the frames of the ratio to the better of the two inputs.
+Every archive in the folder (see `frames`), at every sample count: relative L2 of
+normalised frames, less the reference's noise, of path tracing, of Open Image Denoise,
+and of each combiner (`auto` combines only where the half buffers show that it helps);
+then the geometric mean over the frames of the ratio to the better of the two inputs.
 """
 
 import dataclasses
@@ -16,8 +16,8 @@ import numpy as np
 import tyro
 
 from experiments import frames
-from jscomb import choice, james_stein
-from jscomb.choice import UNTRAINED
+from experiments.rendering import UNTRAINED
+from jscomb import james_stein, methods
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
@@ -44,18 +44,18 @@ def _dual(frame: Frame) -> Image:
     """The dual variant: each half's x with the other half's y."""
     a, b = frame.halves()
     variance = james_stein.smooth_variance(frame.variance)
-    ya, yb = a.biased["oidn"].full, b.biased["oidn"].full
+    ya, yb = a.estimates["oidn"].image, b.estimates["oidn"].image
     return james_stein.combine_dual(a.color, b.color, ya, yb, variance)
 
 
 def images_of(frame: Frame) -> dict[str, Image]:
     """Inputs and combinations by name."""
-    y = frame.biased["oidn"].full
+    key, y = jax.random.key(0), frame.estimates["oidn"].image
     combined = {
-        name: method(frame.color, y, frame.variance)
-        for name, method in UNTRAINED.items()
+        name: methods.combine(key, frame, method=name, biased="oidn").image
+        for name in UNTRAINED
     }
-    found = choice.choose(frame, name="oidn", methods=[choice.KEEP, "whitened"])
+    found = methods.choose(key, frame, biased="oidn", methods=["denoised", "whitened"])
     chosen = combined["whitened"] if found.method == "whitened" else y
     inputs = {"path tracing": frame.color, "oidn": y}
     return inputs | combined | {"auto": chosen, "dual": _dual(frame)}
@@ -75,8 +75,7 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
     """
     found = {}
     for path, samples in frames.cases(config.folder, quick=config.quick):
-        frame = frames.load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frames.load(path, samples).normalised()
         assert frame.reference is not None
         r, noise = frame.reference
         images = images_of(frame)

@@ -21,9 +21,9 @@ from collections.abc import Callable
 import jax
 import tyro
 
+from experiments.rendering import UNTRAINED, of_images
 from experiments.timing import medians
 from jscomb import james_stein
-from jscomb.choice import UNTRAINED
 from jscomb.numerics.windows import window_sum
 
 
@@ -57,7 +57,7 @@ def run(config: Config) -> dict[str, float]:
         "two window sums": lambda x, y, v: (window_sum(x, 15), window_sum(y, 15)),
         "combine": james_stein.combine,
         "combine, whitened": lambda *i: james_stein.combine(*i, whiten=True),
-        **{f"command, {name}": method for name, method in UNTRAINED.items()},
+        **{f"command, {name}": of_images(name) for name in UNTRAINED},
         "combine and its gradient": lambda *i: jax.grad(
             lambda *i: james_stein.combine(*i).sum(), argnums=(0, 1, 2)
         )(*i),

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from experiments.rendering import mirrored
 from experiments.timing import apart
-from jscomb import choice, exr
+from jscomb import exr, methods
 from jscomb.frame import Frame
 from jscomb.numerics import tiles
 
@@ -34,7 +34,7 @@ class Config:
     Attributes:
         frame: EXR file with a biased image `oidn`.
         sizes: widths and heights in pixels.
-        methods: of `jscomb.choice`.
+        methods: of `jscomb.methods`.
         budget: mebibytes of a crop's program.
         whole: largest size that is also combined as a whole.
         quick: one small size.
@@ -79,8 +79,8 @@ def enlarged(frame: Frame, size: int) -> Frame:
         the frame, mirrored at its borders; its biased image without halves, so that no
         method makes it anew.
     """
-    y = frame.biased["oidn"]._replace(halves=None)
-    return mirrored(frame._replace(biased={"oidn": y}, reference=None), size)
+    y = frame.estimates["oidn"]._replace(halves=None)
+    return mirrored(frame._replace(estimates={"oidn": y}, reference=None), size)
 
 
 def measure(
@@ -91,14 +91,14 @@ def measure(
     Args:
         config: frame and budget.
         size: in pixels.
-        method: of `jscomb.choice`.
+        method: of `jscomb.methods`.
         whole: at once, not by crops.
 
     Returns:
         width of a tile, seconds, mebibytes, and the image.
     """
     frame = enlarged(exr.read_frame(config.frame), size)
-    found = choice.local(jax.random.key(0), frame, "oidn", method=method)
+    found = methods.plan(jax.random.key(0), frame, method=method, biased="oidn")
     tile = size
     if not whole:
         tile = tiles.tile_within(**found._asdict(), budget=config.budget * 2**20)
@@ -106,7 +106,7 @@ def measure(
     for _ in range(2):
         start = time.perf_counter()
         if whole:
-            made[:] = found.function(found.images)
+            made[:] = found.whole()
         else:
             for where, part in tiles.stream_crops(**found._asdict(), tile=tile):
                 made[where] = part

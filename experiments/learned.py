@@ -1,12 +1,12 @@
-"""Do trained networks beat the estimators without, on scenes that they never saw?
+"""Do trained networks beat the estimators without, on scenes unseen in training?
 
     python -m experiments.learned FOLDER --runs RUNS --results FILE.json
 
-Every archive in the folder (see `frames`), at every sample count: relative L2, less the
-reference's noise, of both inputs, of the estimators without a network, and of the
-networks: those that come with the package, or each run of `experiments.train` in RUNS
-by the name of its folder. Then the geometric mean over the frames of the ratio to the
-better of the two inputs, and the worst frame.
+Every archive in the folder (see `frames`), at every sample count: relative L2,
+corrected for the reference's noise, of both inputs, of the estimators without a
+network, and of the networks: those that come with the package, or each run of
+`experiments.train` in RUNS by the name of its folder. Then the geometric mean over the
+frames of the ratio to the better of the two inputs, and the worst frame.
 """
 
 import dataclasses
@@ -23,9 +23,9 @@ import tyro
 
 from experiments import frames, train
 from jscomb import double_shrinkage, james_stein, progressive
-from jscomb.choice import UNTRAINED
 from jscomb.frame import Frame
-from jscomb.learning import methods, networks
+from jscomb.learning import networks, recipes
+from jscomb.learning.recipes import RECIPES
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
 
@@ -39,9 +39,9 @@ class Config:
     Attributes:
         folder: of NumPy archives.
         runs: folder of runs; None for the shipped networks.
-        results: file that results are kept in as they come.
+        results: file that stores results as they come.
         curves: picture of all runs' losses to write.
-        quick: only the first archive, at its least sample count.
+        quick: only the first archive, at its minimum sample count.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
@@ -52,7 +52,7 @@ class Config:
 
 
 def _errors(images: dict[str, Image], frame: Frame) -> dict[str, float]:
-    """Relative L2 of each."""
+    """Return the relative L2 of each."""
     assert frame.reference is not None
     r, noise = frame.reference
     error = lambda image: float(rel_l2(image, r, half_difference=noise))
@@ -60,82 +60,109 @@ def _errors(images: dict[str, Image], frame: Frame) -> dict[str, float]:
 
 
 def measure_untrained(frame: Frame) -> dict[str, float]:
-    """Inputs, and combinations without a network."""
-    x, y, v = frame.color, frame.biased["oidn"].full, frame.variance
+    """Return errors of the inputs, and of combinations without a network.
+
+    Args:
+        frame: with the estimate "oidn", its halves and a reference.
+
+    Returns:
+        relative L2 by name.
+    """
+    frame = frame.normalised()
+    oidn = frame.estimates["oidn"]
+    x, y, v = frame.color, oidn.image, frame.variance
+    pooled, robust = james_stein.smooth_variance(v), james_stein.robust_variance(v)
     images = {"path tracing": x, "oidn": y}
-    images |= {name: jax.jit(f)(x, y, v) for name, f in UNTRAINED.items()}
+    images["james-stein"] = james_stein.combine(x, y, pooled)
+    images["whitened"] = james_stein.combine(x, y, robust, window=7, whiten=True)
     regressed, _ = _james_stein_inputs(frame)
-    pooled = james_stein.smooth_variance(v)
     star = (regressed["biased_a"] + regressed["biased_b"]) / 2
     images["y*"] = star
     images["james-stein, y*"] = james_stein.combine(x, star, pooled)
-    shrunk = double_shrinkage.combine_frame(frame, "oidn", stride=2)
-    images |= {"double shrinkage": shrunk.image, "its prior": shrunk.prior}
-    pd = methods.METHODS["pd"].inputs(jax.random.key(0), frame, "oidn")
+    shrunk = double_shrinkage.combine_frame(frame, oidn, stride=2)
+    prior = double_shrinkage.neural_inputs(frame, oidn, stride=2)["prior"]
+    images |= {"double shrinkage": shrunk.image, "its prior": prior}
+    pd = RECIPES["pd"].inputs(jax.random.key(0), frame, oidn)
     mix = functools.partial(progressive.mixing, whiten=True)
     images["progressive, whitened"] = progressive.combine(**pd, mix=mix)
     return _errors(images, frame)
 
 
 def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
-    """Regressed and plain, in this order."""
-    njs = methods.METHODS["njs"]
-    assert njs.other is not None
-    makers = njs.inputs, njs.other
-    both = [make(jax.random.key(0), frame, "oidn") for make in makers]
+    """Return NJS's inputs with the regressed image, then those with the plain one."""
+    estimate = frame.estimates["oidn"]
+    both = [
+        james_stein.neural_inputs(jax.random.key(0), frame, estimate, choose=choose)
+        for choose in ("helps", "opposite")
+    ]
     plain = lambda inputs: bool(jnp.all(inputs["biased_a"] == inputs["biased_b"]))
     return sorted(both, key=plain)
 
 
 def measure_network(
-    frame: Frame, method: str, network: methods.Network
+    frame: Frame, method: str, network: recipes.Network
 ) -> dict[str, float]:
-    """A network as it is used, and with parts of its method left out."""
-    chosen = train.ALL[method]
-    one = jnp.ones((), frame.color.dtype)
-    combine = lambda inputs, **o: chosen.combine(network, inputs, exposure=one, **o)
-    taken = chosen.inputs(jax.random.key(0), frame, "oidn")
-    images = {"": jax.jit(combine)(taken)}
+    """Return errors of a network's combination, and of variants of it.
+
+    Args:
+        frame: with the estimate "oidn", its halves and a reference.
+        method: a key of `train.ALL`.
+        network: of that method.
+
+    Returns:
+        relative L2 by the variant's name, after a comma; "" for none.
+    """
+    frame, recipe = frame.normalised(), train.ALL[method]
+    combine = jax.jit(functools.partial(recipe.combine, network))
+    inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
+    images = {"": combine(inputs)}
     if method.startswith("njs"):
-        regressed, plain = map(jax.jit(combine), _james_stein_inputs(frame))
+        regressed, plain = map(combine, _james_stein_inputs(frame))
         images |= {", always regressed": regressed, ", never regressed": plain}
     if method.startswith("pd"):
-        for name, bound in ((", bound", True), (", no bound", False)):
-            images[name] = jax.jit(functools.partial(combine, bound=bound))(taken)
-    if method == "kernels-njs":
-        images[", its denoiser"] = methods.DENOISERS["kernels"].combine(
-            network.denoiser, taken
+        direct = (
+            progressive.direct_activation if method == "pd" else progressive.activation
         )
+        for name, bound in ((", bound", True), (", no bound", False)):
+            variant = functools.partial(
+                progressive.combine_inputs, activate=direct, bound=bound
+            )
+            images[name] = jax.jit(variant)(network, inputs)
+    if method == "kernels-njs":
+        images[", its denoiser"] = RECIPES["kernels"].combine(network.denoiser, inputs)
     return _errors(images, frame)
 
 
 def networks_of(
     runs: pathlib.Path | None,
-) -> dict[str, tuple[str, methods.Network]]:
-    """Method and network by name.
+) -> dict[str, tuple[str, recipes.Network]]:
+    """Return method and network by name.
 
     Args:
         runs: folder of runs; None for the shipped networks.
 
     Returns:
-        those that are finished.
+        those of finished runs.
     """
     if runs is None:
-        return {name: (name, methods.shipped(name)) for name in methods.METHODS}
+        names = [file.stem for file in recipes.WEIGHTS.glob("*.safetensors")]
+        return {
+            name: (name, recipes.shipped(name)) for name in RECIPES if name in names
+        }
     found = {}
     for card in sorted(runs.glob("*/network.json")):
         about = json.loads(card.read_text())
         if about["steps"] == about["schedule"]["steps"]:
             path = card.with_name("network.safetensors")
-            network = methods.load(train.ALL[about["method"]], path)
+            network = recipes.load_network(train.ALL[about["method"]], path)
             found[card.parent.name] = about["method"], network
     return found | _separate(found)
 
 
 def _separate(
-    found: dict[str, tuple[str, methods.Network]],
-) -> dict[str, tuple[str, methods.Network]]:
-    """A denoiser and a combiner that were not trained jointly, as if they were."""
+    found: dict[str, tuple[str, recipes.Network]],
+) -> dict[str, tuple[str, recipes.Network]]:
+    """Return a denoiser and a combiner that were trained apart, as a joint network."""
     parts = [found.get(f"{name}-light") for name in ("kernels", "njs-equal")]
     if None in parts:
         return {}
@@ -175,7 +202,7 @@ def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
 def summary(
     rows: dict[tuple[str, int], dict[str, float]],
 ) -> dict[str, dict[str, float]]:
-    """Ratios to the better input: geometric mean at each sample count, and the worst.
+    """Return ratios to the better input: geometric means by samples, and the worst.
 
     Args:
         rows: by `run`.
@@ -197,7 +224,7 @@ def summary(
 
 
 def plot_curves(runs: pathlib.Path, out: pathlib.Path) -> None:
-    """Training and validation losses of all runs.
+    """Plot training and validation losses of all runs.
 
     Args:
         runs: folder of runs.

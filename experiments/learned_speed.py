@@ -1,4 +1,4 @@
-"""What does a network cost, beside the convolutions that it cannot do without?
+"""What does a network cost, compared with its convolutions alone?
 
     python -m experiments.learned_speed
 
@@ -14,15 +14,20 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from experiments.timing import medians
 from jscomb.learning import networks
-from jscomb.learning.methods import METHODS
+from jscomb.learning.recipes import RECIPES
 
 CHANNELS = 64  # of the convolution that sets the ceiling
+
+_INPUTS = {
+    "njs": ("unbiased", "biased_a", "biased_b", "variance"),
+    "dsc": ("prior", "unbiased", "biased", "variance", "mse"),
+    "pd": ("unbiased", "biased", "variance", "sure"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +62,13 @@ class Cost(NamedTuple):
 
 
 def operations(network: object) -> float:
-    """Multiplications and additions of a network's convolutions, a pixel.
+    """Count the multiplications and additions of a network's convolutions.
 
     Args:
         network: one of `learning.networks`.
 
     Returns:
-        the number; levels below the first count by their share of the pixels.
+        the number a pixel; levels below the first count by their share of the pixels.
     """
     total = 0.0
     for path, leaf in jax.tree.leaves_with_path(network):
@@ -80,12 +85,16 @@ def operations(network: object) -> float:
 
 
 def inputs_of(method: str, size: int) -> dict[str, jax.Array]:
-    """Random inputs of a method."""
-    names = {
-        "njs": ("unbiased", "biased_a", "biased_b", "variance"),
-        "dsc": ("prior", "unbiased", "biased", "variance", "mse"),
-        "pd": ("unbiased", "biased", "variance", "sure"),
-    }[method]
+    """Return random inputs of a method.
+
+    Args:
+        method: njs, dsc or pd.
+        size: width and height in pixels.
+
+    Returns:
+        images by name.
+    """
+    names = _INPUTS[method]
     keys = jax.random.split(jax.random.key(0), len(names))
     one = {"variance", "mse"} if method == "dsc" else set()
     return {
@@ -110,13 +119,12 @@ def run(config: Config) -> dict[str, Cost]:
     convolve = jax.jit(lambda convolution, image: convolution(image))
     calls: dict[str, Callable] = {"ceiling": functools.partial(convolve, single, image)}
     counts, memory = {"ceiling": operations(single)}, {"ceiling": 0.0}
-    for method, parts in METHODS.items():
-        inputs = inputs_of(method, size)
+    for method in _INPUTS:
+        recipe, inputs = RECIPES[method], inputs_of(method, size)
         for kind in ("light",) if config.quick else ("light", "full"):
-            network, name = parts.network(jax.random.key(3), size=kind), method + " "
+            network, name = recipe.network(jax.random.key(3), size=kind), method + " "
             name += kind
-            combine = jax.jit(functools.partial(parts.combine, exposure=jnp.ones(())))
-            compiled = combine.lower(network, inputs).compile()
+            compiled = jax.jit(recipe.combine).lower(network, inputs).compile()
             used = compiled.memory_analysis().temp_size_in_bytes
             memory[name] = used / size**2
             counts[name] = operations(network)

@@ -17,7 +17,7 @@ from jscomb import (
     uncorrelated,
 )
 from jscomb.denoisers import nfor
-from jscomb.numerics import cholesky, convolution, exposure, kernels, windows
+from jscomb.numerics import cholesky, convolution, kernels, luminance, windows
 from jscomb.numerics import sure as risks
 from jscomb.numerics.weights import (
     bilateral_weights,
@@ -108,7 +108,7 @@ def parts() -> dict[str, Function]:
         "kernels.predicted_mean": _predicted,
         "convolution.convolve": _convolved,
         "cholesky.solve": _systems,
-        "exposure.exposure": lambda r: exposure.exposure(r.unbiased),
+        "luminance.median_luminance": lambda r: luminance.median_luminance(r.unbiased),
         "sure.pooled": lambda r: risks.pooled(
             risks.Risk(r.biased, _sure(r), r.variance),
             r.unbiased,

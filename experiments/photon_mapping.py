@@ -32,9 +32,9 @@ import numpy as np
 import tyro
 
 from experiments import render, scenes
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 
-PHOTONS = "photons"  # the biased image's name
+PHOTONS = "photons"  # the estimate's name
 ALPHA = 2 / 3
 ROOM = 8  # meetings that are stored, times the photons; doubled where it is short
 RADIUS = 0.01  # of the first passes, times the diagonal of the scene
@@ -381,8 +381,8 @@ def assemble(config: Config, moments: dict[str, render.Moments]) -> Frame:
     """
     halves = np.stack([moments[f"photons{k}"].mean[..., :3] for k in range(2)])
     halves = halves.astype(np.float32)
-    image = Biased(halves.mean(axis=0), halves)
-    return render.assemble(config, moments).with_biased(PHOTONS, image)
+    image = Estimate(halves.mean(axis=0), halves)
+    return render.assemble(config, moments).with_estimate(PHOTONS, image)
 
 
 def render_moments(config: Config) -> dict[str, render.Moments]:

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from matplotlib.colors import SymLogNorm
 
-from experiments.combiners import COMBINERS
+from experiments.combiners import combiners
 from jscomb import exr
 from jscomb.frame import Frame
 from jscomb.typing import Image
@@ -32,12 +32,12 @@ class Config:
 
     Attributes:
         frames: EXR files with a reference and the denoised image `oidn`.
-        combiners: keys of `COMBINERS`.
+        combiners: names of `experiments.combiners`.
         plot: picture of the maps to write.
     """
 
     frames: tyro.conf.Positional[tuple[pathlib.Path, ...]]
-    combiners: tuple[str, ...] = ("whitened 7x7", "njs", "pd", "dsc")
+    combiners: tuple[str, ...] = ("whitened", "njs", "pd", "dsc")
     plot: pathlib.Path | None = None
 
 
@@ -63,8 +63,8 @@ def changed(image: Image, frame: Frame) -> Changed:
     """Compare an image with the denoised one.
 
     Args:
-        image: radiance at an exposure of one, [H,W,3].
-        frame: with reference and `oidn`, likewise.
+        image: normalised radiance, [H,W,3].
+        frame: normalised, with reference and `oidn`.
 
     Returns:
         the change of every pixel's error, and its parts.
@@ -72,12 +72,12 @@ def changed(image: Image, frame: Frame) -> Changed:
     Raises:
         ValueError: if the frame lacks either.
     """
-    if frame.reference is None or "oidn" not in frame.biased:
+    if frame.reference is None or "oidn" not in frame.estimates:
         raise ValueError("a frame has no reference or no biased image 'oidn'")
     r = frame.reference.image
     weight = jnp.square(jnp.mean(r, axis=-1)) + 0.01
     error = lambda i: np.asarray(jnp.mean(jnp.square(i - r), axis=-1) / weight)
-    before = error(frame.biased["oidn"].full)
+    before = error(frame.estimates["oidn"].image)
     change = error(image) - before
     fell, rose = change < 0, change > 0
     return Changed(
@@ -100,10 +100,9 @@ def run(config: Config) -> dict[tuple[str, str], Changed]:
     """
     found = {}
     for path in config.frames:
-        frame = exr.read_frame(path)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = exr.read_frame(path).normalised()
         for name in config.combiners:
-            chosen = COMBINERS[name]
+            chosen = combiners()[name]
             given = [frame, jnp.float32(1)] if chosen.traced else [frame]
             found[path.stem, name] = changed(chosen.combine(*given), frame)
     return found

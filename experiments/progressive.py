@@ -11,6 +11,7 @@ errors. An interrupted run goes on where it was.
 """
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Iterator
 
@@ -21,8 +22,8 @@ from matplotlib import pyplot as plt
 from tqdm import tqdm
 
 from experiments import render
-from experiments.sure_error import oidn_of
 from jscomb import james_stein, plots, progressive
+from jscomb.denoisers import oidn
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
@@ -82,7 +83,8 @@ def stages(config: Config) -> Iterator[Frame]:
 def mixed(frame: Frame) -> dict[str, tuple[Image, Image]]:
     """Samples, denoised and mixed image, each with its estimated squared error."""
     x, v = frame.color, frame.variance
-    estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), oidn_of(frame), x, v)
+    denoise = functools.partial(oidn.denoise_color, frame=frame)
+    estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), denoise, x, v)
     y, s, _ = estimate(v)
     # To mix by, no pixel shall be more certain than those around it.
     robust = james_stein.robust_variance(v)
@@ -115,8 +117,8 @@ def run(config: Config) -> dict[int, dict[str, tuple[float, float]]]:
     found: dict[int, dict[str, tuple[float, float]]] = {}
     for frame in stages(config):
         assert frame.samples is not None
-        frame = frame.scaled(1 / frame.exposure)
-        samples, images = int(frame.samples), mixed(frame)
+        samples, frame = int(frame.samples), frame.normalised()
+        images = mixed(frame)
         found[samples] = {n: errors(frame, *pair) for n, pair in images.items()}
         row = (f"{n} {a:.5f} ({b:.5f})" for n, (a, b) in found[samples].items())
         tqdm.write(f"{samples} spp: " + ", ".join(row))

@@ -1,10 +1,9 @@
 """Scenes drawn at random: geometry, materials, textures, lights, camera from a seed.
 
-For training, so that the scenes which errors are reported on stay unseen. Each is a
-room (closed, open in front, or with a window to the sky) or a place under the sky,
-furnished with solids, meshes, foliage and rods. Many have what makes path tracing hard:
-small or hidden lights, glass, mirrors. Rooms are some two units wide, and lights about
-as bright as makes a radiance of one.
+For training, so that the scenes of reported errors stay unseen. Each is a room (closed,
+open in front, or with a window to the sky) or a place under the sky, furnished with
+solids, meshes, foliage and rods. Many are hard for path tracing: small or hidden
+lights, glass, mirrors. Rooms are about two units wide, and radiance is about one.
 """
 
 import numpy as np
@@ -13,11 +12,11 @@ TEXTURE = 128  # width of a drawn texture in texels
 
 
 def random_scene(mi, seed: int) -> dict:
-    """A scene without film, sampler and integrator.
+    """Return a scene without film, sampler and integrator.
 
     Args:
         mi: Mitsuba.
-        seed: what to draw; the same seed gives the same scene.
+        seed: of the scene.
 
     Returns:
         a dictionary for `mitsuba.load_dict`, with a `sensor`.
@@ -36,7 +35,7 @@ def random_scene(mi, seed: int) -> dict:
 
 
 def _walls(mi, rng, half, kind: str) -> dict:
-    """The floor, and what a kind of place has of walls and ceiling, [-half, half]."""
+    """Return the floor, walls and ceiling of a kind of place in [-half, half]."""
     at = mi.ScalarTransform4f()
     x, y, z = (float(h) for h in half)
     if kind == "outdoors":
@@ -60,7 +59,7 @@ def _walls(mi, rng, half, kind: str) -> dict:
 
 
 def _furniture(mi, rng, half) -> dict:
-    """Things that stand, lie or hang in the back two thirds of the place."""
+    """Return things in the back two thirds of the place."""
     makers = [_solid, _solid, _solid, _blob, _torus, _foliage, _rods]
     return {
         f"thing{number}": makers[rng.integers(len(makers))](mi, rng, half)
@@ -69,7 +68,7 @@ def _furniture(mi, rng, half) -> dict:
 
 
 def _place(mi, rng, half, size: float):
-    """A transform that puts something of a radius `size` somewhere, turned somehow."""
+    """Draw the position and rotation of something of radius `size`."""
     x, y, z = half
     where = [
         rng.uniform(-0.75, 0.75) * x,
@@ -83,7 +82,7 @@ def _place(mi, rng, half, size: float):
 
 
 def _solid(mi, rng, half) -> dict:
-    """A sphere, a box or a cylinder."""
+    """Return a sphere, a box or a cylinder."""
     size = rng.uniform(0.1, 0.42)
     at, name = _place(mi, rng, half, size), rng.choice(["sphere", "cube", "cylinder"])
     if name == "cylinder":
@@ -97,7 +96,7 @@ def _solid(mi, rng, half) -> dict:
 
 
 def _blob(mi, rng, half) -> dict:
-    """A sphere with bumps."""
+    """Return a sphere with bumps."""
     size = rng.uniform(0.15, 0.4)
     turns = rng.normal(size=(6, 3)) * rng.uniform(2, 7)
     phases = rng.uniform(0, 2 * np.pi, 6)
@@ -113,7 +112,7 @@ def _blob(mi, rng, half) -> dict:
 
 
 def _torus(mi, rng, half) -> dict:
-    """A ring, perhaps knotted."""
+    """Return a ring, perhaps with waves."""
     size, thickness = rng.uniform(0.15, 0.35), rng.uniform(0.15, 0.4)
     waves = int(rng.choice([0, 0, 2, 3, 5]))
 
@@ -129,7 +128,7 @@ def _torus(mi, rng, half) -> dict:
 
 
 def _sheet(mi, rng, shape, at, steps: int) -> dict:
-    """A surface over u in [0, 2 pi] and v in [0, 1] as a mesh of triangles."""
+    """Triangulate a surface over u in [0, 2 pi] and v in [0, 1]."""
     u, v = np.meshgrid(
         np.linspace(0, 2 * np.pi, steps + 1),
         np.linspace(0, 1, steps + 1),
@@ -146,7 +145,7 @@ def _sheet(mi, rng, shape, at, steps: int) -> dict:
 
 
 def _foliage(mi, rng, half) -> dict:
-    """Some hundreds of leaves, turned at random."""
+    """Return some hundred leaves, rotated at random."""
     number, size = int(rng.integers(100, 500)), rng.uniform(0.2, 0.45)
     centre = rng.normal(size=(number, 3)) * size / 2
     frame, _ = np.linalg.qr(rng.normal(size=(number, 3, 3)))
@@ -162,7 +161,7 @@ def _foliage(mi, rng, half) -> dict:
 
 
 def _rods(mi, rng, half) -> dict:
-    """A grating of thin upright bars, as in a railing or a lattice."""
+    """Return a row of thin upright bars, such as a railing."""
     number, height = int(rng.integers(6, 30)), rng.uniform(0.3, 0.9)
     width = rng.uniform(0.4, 1.2)
     thin = width / number * rng.uniform(0.1, 0.35)
@@ -183,7 +182,7 @@ def _rods(mi, rng, half) -> dict:
 
 
 def _mesh(mi, corners, faces, texture, at, bsdf: dict):
-    """A triangle mesh as Mitsuba's object."""
+    """Return a triangle mesh as Mitsuba's object."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh(
@@ -200,7 +199,7 @@ def _mesh(mi, corners, faces, texture, at, bsdf: dict):
 
 
 def _lights(mi, rng, half, kind: str) -> dict:
-    """The sky where it can be seen, and lamps: broad, small, or hidden by a shade."""
+    """Return the sky where it is visible, and lamps."""
     lights = {}
     if kind in ("window", "outdoors"):
         sky = {"type": "envmap", "bitmap": mi.Bitmap(_sky(rng))}
@@ -212,7 +211,7 @@ def _lights(mi, rng, half, kind: str) -> dict:
 
 
 def _lamp(mi, rng, half, name: str, power: float) -> dict:
-    """A rectangle below the ceiling or a bulb, perhaps over a shade; equal power."""
+    """Return a rectangle below the ceiling or a bulb, perhaps with a shade."""
     at = mi.ScalarTransform4f()
     x, y, z = (float(h) for h in half)
     width = float(np.exp(rng.uniform(np.log(0.04), np.log(0.5))))
@@ -237,7 +236,7 @@ def _lamp(mi, rng, half, name: str, power: float) -> dict:
 
 
 def _camera(mi, rng, half, *, outside: bool) -> dict:
-    """From the front of the place, or before it, towards somewhere in its back."""
+    """Return a camera at or before the front of the place that looks to its back."""
     x, y, z = half
     far = rng.uniform(1.3, 2.2) if outside else rng.uniform(0.75, 0.95)
     origin = [rng.uniform(-0.6, 0.6) * x, rng.uniform(-0.3, 0.7) * y, far * z]
@@ -256,7 +255,7 @@ def _camera(mi, rng, half, *, outside: bool) -> dict:
 
 
 def _surface(mi, rng, tiles: int = 1) -> dict:
-    """What walls and floors are made of: never clear."""
+    """Return an opaque material for walls and floors."""
     reflectance = _reflectance(mi, rng, tiles)
     if rng.random() < 0.7:
         return _diffuse(reflectance)
@@ -266,7 +265,7 @@ def _surface(mi, rng, tiles: int = 1) -> dict:
 
 
 def _material(mi, rng, *, clear: bool = True) -> dict:
-    """What things are made of."""
+    """Return a material for things."""
     kinds = ["diffuse", "roughplastic", "plastic", "roughconductor", "conductor"]
     kinds += ["dielectric", "roughdielectric"] if clear else ["diffuse"] * 2
     kind = rng.choice(kinds, p=[0.42, 0.18, 0.08, 0.12, 0.06, 0.1, 0.04])
@@ -287,7 +286,7 @@ def _material(mi, rng, *, clear: bool = True) -> dict:
 
 
 def _reflectance(mi, rng, tiles: int = 1) -> dict:
-    """One colour, a checker or a drawn texture."""
+    """Return one colour, a checkerboard or a texture."""
     kind = rng.random()
     if kind < 0.35:
         return _colour(rng)
@@ -300,7 +299,7 @@ def _reflectance(mi, rng, tiles: int = 1) -> dict:
 
 
 def _texture(mi, rng, tiles: int = 1) -> dict:
-    """Two colours mixed by a drawn pattern: fractal, stripes, spots, or bricks."""
+    """Return two colours mixed by fractals, stripes, spots or bricks."""
     v, u = np.mgrid[:TEXTURE, :TEXTURE] / TEXTURE
     kind = rng.choice(["fractal", "stripes", "spots", "bricks"])
     if kind == "fractal":
@@ -328,7 +327,7 @@ def _texture(mi, rng, tiles: int = 1) -> dict:
 
 
 def _fractal(rng, first: int = 1) -> np.ndarray:
-    """Structure at every scale from 2^first cells, in [0, 1]."""
+    """Return noise in [0, 1] at every scale from 2^first cells."""
     total = np.zeros((TEXTURE, TEXTURE))
     for octave in range(first, 7):
         cells = 2**octave
@@ -339,7 +338,7 @@ def _fractal(rng, first: int = 1) -> np.ndarray:
 
 
 def _sky(rng, height: int = 64) -> np.ndarray:
-    """A clear or clouded sky, often with a small sun, [h,2h,3]."""
+    """Return a sky, often with a small sun, shape [h,2h,3]."""
     up = np.cos(np.linspace(0, np.pi, height))[:, None, None]
     zenith, horizon = (
         rng.uniform([0.2, 0.4, 0.7], [0.6, 0.8, 1.2]),
@@ -372,6 +371,6 @@ def _rgb(value) -> dict:
 
 
 def _colour(rng) -> dict:
-    """A reflectance: grey or coloured, dark or bright."""
+    """Return a reflectance: grey or coloured, dark or bright."""
     grey, spread = rng.uniform(0.1, 0.8), rng.choice([0.05, 0.3])
     return _rgb((grey + rng.uniform(-spread, spread, 3)).clip(0.03, 0.9))

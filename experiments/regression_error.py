@@ -4,7 +4,7 @@
 
 Every archive in the folder (see `frames`), at every sample count and with two biased
 images y: Open Image Denoise, and non-local means, a weak one. Relative L2, less the
-reference's noise, at an exposure of 1, of y and of y*; what `worth_regressing` says of
+reference's noise, of normalised frames, of y and y*; what `worth_regressing` says of
 the change, and the reference; and NFOR. Results are kept in the file as they come, and
 what is in it is not measured again.
 """
@@ -15,7 +15,6 @@ import pathlib
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -23,7 +22,7 @@ from experiments import frames
 from jscomb import james_stein
 from jscomb.denoisers import nfor, nonlocal_means
 from jscomb.features import select, stack
-from jscomb.frame import Biased, Frame
+from jscomb.frame import Estimate, Frame
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
 
@@ -52,14 +51,13 @@ BASES = ("oidn", "non-local means")
 
 cross = jax.jit(james_stein.cross_regression, static_argnames=("window", "stride"))
 worth = jax.jit(james_stein.worth_regressing, static_argnames=("window", "stride"))
-means = jax.jit(nonlocal_means.denoise)
 
 
-def inputs_of(frame: Frame, base: Biased) -> tuple[Image, ...]:
+def inputs_of(frame: Frame, base: Estimate) -> tuple[Image, ...]:
     """What `cross_regression` takes: both halves' images, and features that tell.
 
     Args:
-        frame: with halves, at an exposure of 1.
+        frame: normalised, with halves.
         base: a biased image of it with halves.
 
     Returns:
@@ -76,15 +74,11 @@ def inputs_of(frame: Frame, base: Biased) -> tuple[Image, ...]:
     return (a.color, b.color, *base.halves, *others)
 
 
-def base_of(frame: Frame, name: str) -> Biased:
+def base_of(frame: Frame, name: str) -> Estimate:
     """A biased image of the frame and of its halves, by name."""
     if name != "non-local means":
-        return frame.biased[name]
-    full, *halves = (
-        means(part.color, part.color, part.variance)
-        for part in (frame, *frame.halves())
-    )
-    return Biased(full, jnp.stack(halves))
+        return frame.estimates[name]
+    return nonlocal_means.denoise_frame(frame)
 
 
 def measure(frame: Frame, name: str, config: Config) -> Row:
@@ -96,7 +90,7 @@ def measure(frame: Frame, name: str, config: Config) -> Row:
     )
     base = base_of(frame, name)
     inputs = inputs_of(frame, base)
-    y = base.full
+    y = base.image
     options = {"window": config.window, "stride": config.stride}
     star = sum(cross(*inputs, **options)) / 2
     noise_of = james_stein.guide_noise(*inputs[2:4], robust=False)
@@ -143,7 +137,7 @@ def measure_nfor(frame: Frame) -> Row:
     """Relative L2 of NFOR."""
     assert frame.reference is not None
     r, noise = frame.reference
-    image = nfor.denoise_frame(frame).full
+    image = nfor.denoise_frame(frame).image
     return {"y": float(rel_l2(image, r, half_difference=noise))}
 
 

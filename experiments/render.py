@@ -21,13 +21,14 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 from experiments import scenes, streams
-from jscomb import exr
+from jscomb import exr, methods
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame, Reference, make_frame
 
@@ -389,7 +390,8 @@ def write(config: Config, frame: Frame) -> Frame:
         the frame that was written.
     """
     if config.denoise and oidn.available():
-        frame = frame.with_biased("oidn", oidn.denoise_frame(frame))
+        denoised = methods.combine(jax.random.key(0), frame, method="oidn")
+        frame = frame.with_estimate("oidn", denoised)
     provenance = {
         "renderer": f"Mitsuba {scenes.mitsuba().__version__}",
         "variant": scenes.mitsuba().variant(),

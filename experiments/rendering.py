@@ -1,5 +1,6 @@
 """A frame's images as one tree of arrays, what functions are tried and timed on."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Self, TypeVar
 
 import jax
@@ -8,10 +9,29 @@ import numpy as np
 
 from jscomb.denoisers import smoothing
 from jscomb.features import select, stack
-from jscomb.frame import Frame
+from jscomb.frame import Estimate, Frame, make_frame
+from jscomb.methods import METHODS
 from jscomb.typing import Image, Scalar, Variance
 
 Tree = TypeVar("Tree")
+
+UNTRAINED = "james-stein", "whitened"
+"""Combiners of one estimate without a network."""
+
+
+def of_images(method: str) -> Callable[[Image, Image, Variance], Image]:
+    """A method as a function of images, for `jit` and derivatives.
+
+    Args:
+        method: a pure one of one estimate.
+
+    Returns:
+        the function of x, y and the variance of the mean x, [H,W,C] each.
+    """
+    key = jax.random.key(0)
+    return lambda x, y, v: METHODS[method].image(
+        key, make_frame(x, variance=v), Estimate(y)
+    )
 
 
 class Rendering(NamedTuple):
@@ -71,9 +91,9 @@ def rendering_of(frame: Frame, *, name: str = "oidn") -> Rendering:
     a, b = frame.halves()
     features = stack(frame)
     features = select([features]).of(features)
-    biased = a.biased[name].full, b.biased[name].full
+    biased = a.estimates[name].image, b.estimates[name].image
     images = a.color, b.color, *biased, frame.variance, features
-    return Rendering(*images, frame.exposure)
+    return Rendering(*images, frame.median_luminance)
 
 
 def mirrored(images: Tree, size: int) -> Tree:

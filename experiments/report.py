@@ -24,7 +24,7 @@ import tyro
 from tqdm import tqdm
 
 from experiments import convergence, equal_time, pareto
-from experiments.combiners import COMBINERS
+from experiments.combiners import combiners
 from experiments.sweep import Record, results
 from jscomb import exr, metrics
 from jscomb.frame import Frame
@@ -54,7 +54,7 @@ class Config:
     combiners: tuple[str, ...] = (
         "path tracing",
         "oidn",
-        "whitened 7x7",
+        "whitened",
         "njs",
         "pd",
         "dsc",
@@ -82,7 +82,7 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
 
     Args:
         path: EXR file with a reference.
-        combiners: keys of `COMBINERS`.
+        combiners: names of `experiments.combiners`.
 
     Returns:
         name, width, height, images by name as text, relative L2 by name.
@@ -91,9 +91,9 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
         ValueError: if the frame has no reference, or no denoised image.
     """
     frame = exr.read_frame(path)
-    if frame.reference is None or "oidn" not in frame.biased:
+    if frame.reference is None or "oidn" not in frame.estimates:
         raise ValueError(f"{path} has no reference or no biased image 'oidn'")
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.normalised()
     images = {name: _made(frame, name) for name in combiners}
     assert frame.reference is not None
     r, noise = frame.reference
@@ -113,7 +113,7 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
 
 def _made(frame: Frame, name: str) -> Image:
     """A combiner's image."""
-    combiner = COMBINERS[name]
+    combiner = combiners()[name]
     return combiner.combine(*([frame, jnp.float32(1)] if combiner.traced else [frame]))
 
 

@@ -2,8 +2,8 @@
 
     python -m experiments.ship njs RUNS/njs-light FOLDER --results FILE.json
 
-The card says what the network was trained on and how, its losses, and its errors on the
-frames of FOLDER, which it has never seen, as `experiments.learned` measures them.
+The card holds the network's training data, schedule and losses, and its errors, as
+`experiments.learned` measures them, on the frames of FOLDER, unseen in training.
 """
 
 import dataclasses
@@ -15,9 +15,7 @@ import sys
 import tyro
 
 from experiments import learned
-from jscomb.learning import methods
-
-WEIGHTS = pathlib.Path(methods.__file__).parent / "weights"
+from jscomb.learning.recipes import WEIGHTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Config:
         method: njs, dsc or pd.
         network: folder of a finished run, in a folder of runs.
         folder: of NumPy archives to measure on.
-        results: file that results are kept in as they come.
+        results: file that stores results as they come.
         out: folder of the package's networks.
     """
 

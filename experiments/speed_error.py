@@ -212,14 +212,14 @@ def regressed(frame: Frame, setting: Setting, repeats: int) -> tuple[Image, floa
     """Regress the frame's denoised image.
 
     Args:
-        frame: with `oidn`, at an exposure of 1.
+        frame: normalised, with `oidn`.
         setting: how.
         repeats: timed calls.
 
     Returns:
         y*, and the median seconds of one call.
     """
-    inputs = inputs_of(frame, frame.biased["oidn"])
+    inputs = inputs_of(frame, frame.estimates["oidn"])
     with (
         jax.enable_x64(setting.bits == 64),
         mock.patch.object(regression, "_SIDE", setting.side),
@@ -254,8 +254,7 @@ def run(config: Config) -> tuple[dict[str, float], Results]:
     settings = SETTINGS[:2] if config.quick else SETTINGS
     found: Results = {setting: ([], []) for setting in settings}
     for path, samples in tqdm(cases, unit="frame"):
-        frame = frames.load(path, samples)
-        frame = frame.scaled(1 / frame.exposure)
+        frame = frames.load(path, samples).normalised()
         assert frame.reference is not None
         r, noise = frame.reference
         for setting in settings:

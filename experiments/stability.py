@@ -16,10 +16,12 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from jscomb import choice, ensemble, progressive
+from experiments.rendering import UNTRAINED, of_images
+from jscomb import ensemble, progressive
 from jscomb.denoisers import smoothing
-from jscomb.learning import methods
+from jscomb.learning import recipes
 from jscomb.numerics.guards import finite
+from jscomb.numerics.luminance import median_luminance
 from jscomb.typing import Image, Variance
 
 
@@ -98,10 +100,12 @@ Combine = Callable[[Image, Image, Variance], Image]
 
 def _network(name: str, inputs: Callable[..., dict[str, Image]]) -> Combine:
     """A trained network's combiner, of three images."""
-    network = methods.shipped(name)
+    network = recipes.shipped(name)
 
     def combine(x: Image, y: Image, v: Variance) -> Image:
-        return methods.METHODS[name].combine(network, inputs(x, y, v))
+        unit = median_luminance(x)
+        normalised = recipes.in_unit(inputs(x, y, v), unit)
+        return unit * recipes.RECIPES[name].combine(network, normalised)
 
     return combine
 
@@ -127,7 +131,7 @@ def combiners(*, networks: bool = True) -> dict[str, Combine]:
         return ensemble.combine(bases, bases, bases, x, x, solver="hull", filter=False)
 
     found: dict[str, Combine] = {
-        **choice.UNTRAINED,
+        **{name: of_images(name) for name in UNTRAINED},
         "progressive": lambda x, y, v: progressive.combine(x, y, v, sure(x, y, v)),
         "ensemble": of_bases,
     }

@@ -65,11 +65,9 @@ class Config:
     quick: bool = False
 
 
-def oidn_of(frame: Frame) -> Callable[[Image], Image]:
-    """Open Image Denoise with the frame's features and exposure."""
-    return lambda x: oidn.denoise(
-        x, albedo=frame.albedo, normal=frame.normal, exposure=frame.exposure
-    )
+def _oidn(frame: Frame) -> Callable[[Image], Image]:
+    """Open Image Denoise with the frame's features."""
+    return functools.partial(oidn.denoise_color, frame=frame)
 
 
 def bilateral_of(frame: Frame) -> Callable[[Image], Image]:
@@ -116,7 +114,7 @@ def probes(frame: Frame, counts: tuple[int, ...], repeats: int) -> list[dict]:
     """Time and standard error of SURE for both denoisers, by both ways."""
     x, v = frame.color, frame.variance
     rows = []
-    for name, denoise in (("bilateral", bilateral_of(frame)), ("oidn", oidn_of(frame))):
+    for name, denoise in (("bilateral", bilateral_of(frame)), ("oidn", _oidn(frame))):
         plain = medians({"": functools.partial(jax.jit(denoise), x)}, repeats)[""]
         for count in counts:
             ways = {
@@ -158,7 +156,7 @@ def measure(frame: Frame) -> dict[str, float]:
     r, noise = frame.reference
     x, v = frame.color, frame.variance
     error = lambda image: float(rel_l2(image, r, half_difference=noise))
-    denoise = jax.jit(oidn_of(frame))
+    denoise = jax.jit(_oidn(frame))
     estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), denoise, x, v)
     risk = estimate(v)
     y, s = risk.denoised, risk.squared_error
@@ -207,7 +205,7 @@ def run(config: Config) -> dict:
     if config.quick:
         path, samples = frames.cases(config.folder, quick=True)[0]
     frame = frames.load(path, samples)  # before the long part, in case it is missing
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frame.normalised()
     found = frames.measured(
         config.folder, {"": measure}, results=config.results, quick=config.quick
     )

@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 import jscomb
 from experiments import frames, render
-from experiments.combiners import COMBINERS
+from experiments.combiners import combiners
 from experiments.timing import apart
 from jscomb import exr, metrics
 from jscomb.denoisers import oidn
@@ -56,7 +56,7 @@ class Config:
         seeds: how many frames of each, of independent samples.
         size: width and height of rendered frames in pixels.
         reference_spp: samples a pixel of their references.
-        combiners: keys of `COMBINERS`; all by default.
+        combiners: names of `experiments.combiners`; all by default.
         scales: factors for the variance, where a combiner is traced.
         repeats: timed calls.
         quick: one tiny scene, two seeds, three combiners.
@@ -69,15 +69,18 @@ class Config:
     seeds: int = 4
     size: int = 128
     reference_spp: int = 4096
-    combiners: tuple[str, ...] = tuple(COMBINERS)
+    combiners: tuple[str, ...] = dataclasses.field(
+        default_factory=lambda: tuple(combiners())
+    )
     scales: tuple[float, ...] = (1.0,)
     repeats: int = 3
     quick: bool = False
 
     def __post_init__(self) -> None:
         """Reject what is not there."""
-        if unknown := set(self.combiners) - set(COMBINERS):
-            raise ValueError(f"no combiner {sorted(unknown)}; there are {[*COMBINERS]}")
+        known = list(combiners())
+        if unknown := set(self.combiners) - set(known):
+            raise ValueError(f"no combiner {sorted(unknown)}; there are {known}")
 
 
 QUICK = {
@@ -86,7 +89,7 @@ QUICK = {
     "seeds": 2,
     "size": 32,
     "reference_spp": 64,
-    "combiners": ("path tracing", "oidn", "whitened 7x7"),
+    "combiners": ("path tracing", "oidn", "whitened"),
     "scales": (1.0, 4.0),
     "repeats": 1,
 }
@@ -98,7 +101,7 @@ class Case(NamedTuple):
     Attributes:
         scene: its name.
         spp: samples a pixel.
-        frames: one a seed, at an exposure of one, with reference.
+        frames: one a seed, normalised, with reference.
         sample: seconds of one sample a pixel; None where nothing was rendered.
     """
 
@@ -122,7 +125,7 @@ def cases(config: Config) -> Iterator[Case]:
             path = pathlib.Path(scene)
             for spp in frames.sample_counts(path):
                 frame = frames.load(path, spp)
-                yield Case(path.stem, spp, [frame.scaled(1 / frame.exposure)], None)
+                yield Case(path.stem, spp, [frame.normalised()], None)
             continue
         # Where Mitsuba and XLA have both compiled code, an exception may end a process.
         files, seconds = apart(_rendered, config, scene)
@@ -131,11 +134,11 @@ def cases(config: Config) -> Iterator[Case]:
 
 
 def _of_files(paths: list[pathlib.Path]) -> list[Frame]:
-    """All seeds, at the exposure of their reference, so that they are alike."""
+    """All seeds, normalised by their reference, so that they are alike."""
     read = [exr.read_frame(path) for path in paths]
     assert read[0].reference is not None
     unit = jnp.median(read[0].reference.image)
-    return [frame.scaled(1 / unit) for frame in read]
+    return [frame.normalised(unit) for frame in read]
 
 
 def _rendered(
@@ -219,14 +222,14 @@ def measure(
 
     Args:
         case: the frames.
-        name: key of `COMBINERS`.
+        name: of `experiments.combiners`.
         config: scales and repeats.
         denoising: seconds of Open Image Denoise on a frame.
 
     Yields:
         one record for each factor of the variance.
     """
-    chosen, seeds = COMBINERS[name], case.frames
+    chosen, seeds = combiners()[name], case.frames
     scales = config.scales if chosen.traced else (1.0,)
     # One frame's time is what a user waits for, not its share of a batch.
     if chosen.traced:
@@ -267,7 +270,7 @@ def _compiled(name: str) -> tuple[Callable, Callable]:
 
     Kept: compiled anew for every case, programs that were given up made libgcc crash.
     """
-    combine = COMBINERS[name].combine
+    combine = combiners()[name].combine
     over_seeds = jax.vmap(combine, (0, None))
     return jax.jit(combine), jax.jit(jax.vmap(over_seeds, (None, 0)))
 
@@ -372,7 +375,7 @@ def run(
         denoising = functools.cache(of_case)
         for name in config.combiners:
             bar.set_description(f"{case.scene} {case.spp} {name}")
-            scales = config.scales if COMBINERS[name].traced else (1.0,)
+            scales = config.scales if combiners()[name].traced else (1.0,)
             keys = [key_of(pixels, name, scale, config.repeats) for scale in scales]
             if any(key not in done for key in keys):
                 made = measure(case, name, config, denoising=denoising())

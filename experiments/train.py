@@ -3,9 +3,9 @@
     python -m experiments.train njs DATASET --out RUN --size light
 
 Frames of one scene in ten are held out for validation. RUN gets the network
-(`network.safetensors` with its card `network.json`), the state to go on from, the
-losses and a plot of them; the same command goes on with a run that was interrupted.
-`--quick` is a minute of it.
+(`network.safetensors` with its card `network.json`), the state to resume from, the
+losses and a plot of them; the same command resumes an interrupted run. `--quick` takes
+a minute.
 """
 
 import dataclasses
@@ -26,11 +26,11 @@ from tqdm import tqdm
 
 from experiments.ablations import ABLATIONS
 from jscomb import exr, metrics
-from jscomb.learning import files, methods, training
-from jscomb.learning.methods import DENOISERS, METHODS
+from jscomb.learning import checkpoints, recipes, training
+from jscomb.learning.recipes import RECIPES
 from jscomb.typing import Image, Scalar
 
-ALL = METHODS | DENOISERS | ABLATIONS
+ALL = RECIPES | ABLATIONS
 QUICK = training.Schedule(steps=60, batch=4, crop=48)
 SAVE_EVERY = 60.0  # seconds
 
@@ -60,13 +60,13 @@ class Config:
     quick: bool = False
 
     def __post_init__(self) -> None:
-        """Reject what cannot be trained."""
+        """Raise for an unknown method."""
         if self.method not in ALL:
             raise ValueError(f"no method {self.method!r}; there are {', '.join(ALL)}")
 
 
 def scene_of(file: pathlib.Path) -> str:
-    """The scene that a frame shows, from its name less the sample count.
+    """Return the scene that a frame shows: its name without the sample count.
 
     Args:
         file: of a frame.
@@ -78,7 +78,7 @@ def scene_of(file: pathlib.Path) -> str:
 
 
 def split(data: pathlib.Path) -> tuple[list[pathlib.Path], list[pathlib.Path]]:
-    """Frames to train on and to validate on, of different scenes.
+    """Return frames to train on and frames to validate on, of different scenes.
 
     Args:
         data: folder of frames.
@@ -101,12 +101,11 @@ def split(data: pathlib.Path) -> tuple[list[pathlib.Path], list[pathlib.Path]]:
 
 
 def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
-    """The inputs of frames for a method, at an exposure of one.
+    """Return a recipe's inputs of normalised frames.
 
     Args:
         method: a key of `ALL`.
-        frames: files with the biased image "oidn" and a reference; black ones are left
-            out.
+        frames: files with the estimate "oidn" and a reference; black ones are skipped.
 
     Returns:
         the examples.
@@ -117,13 +116,16 @@ def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
         if frame.reference is None:
             raise ValueError(f"{file} has no reference")
         if not float(jnp.median(frame.reference.image)) > 0:
-            continue  # a camera where no light comes
+            continue  # the camera sees no light
+        frame = frame.normalised()
+        assert frame.reference is not None
+        estimate = frame.estimates["oidn"]
         makers = filter(None, (ALL[method].inputs, ALL[method].other))
-        variants = [make(jax.random.key(number), frame, "oidn") for make in makers]
+        variants = [make(jax.random.key(number), frame, estimate) for make in makers]
         inputs.append(
             {name: np.stack([v[name] for v in variants]) for name in variants[0]}
         )
-        references.append(np.asarray(frame.reference.image / frame.exposure))
+        references.append(np.asarray(frame.reference.image))
     arrays = {name: np.stack([i[name] for i in inputs]) for name in inputs[0]}
     return training.Examples(
         {name: jnp.asarray(a, jnp.float32) for name, a in arrays.items()},
@@ -134,27 +136,28 @@ def prepare(method: str, frames: list[pathlib.Path]) -> training.Examples:
 def objective(
     method: str, *, loss: Callable[[Image, Image], Scalar] | None = None
 ) -> training.Objective:
-    """The loss of a method's network on one frame.
+    """Return the loss of a method's network on one frame.
 
     Args:
         method: a key of `ALL`.
-        loss: of an image and a reference; None for the method's own.
+        loss: of an image and a reference; None for the recipe's own.
 
     Returns:
-        of network, inputs, reference and exposure; in units of that exposure.
+        the loss of a network, inputs, a reference, and the unit to measure them in.
     """
     chosen = ALL[method]
     measure = loss or chosen.loss
 
-    def of_frame(network, inputs, reference, exposure):
-        image = chosen.combine(network, inputs, exposure=exposure, **chosen.training)
-        return measure(image / exposure, reference / exposure)
+    def of_frame(network, inputs, reference, unit):
+        inputs = recipes.in_unit(inputs, unit)
+        image = chosen.combine(network, inputs, **chosen.training)
+        return measure(image, reference / unit)
 
     return of_frame
 
 
 def run(config: Config) -> dict:
-    """Train, or go on training.
+    """Train, or resume training.
 
     Args:
         config: the run.
@@ -184,7 +187,7 @@ def run(config: Config) -> dict:
     )
     state = training.start(network, schedule)
     if history:
-        state = files.load(config.out / "state.safetensors", state)
+        state = checkpoints.load(config.out / "state.safetensors", state)
     else:
         history = {"step": [0], "train": [None], "validation": [float(judge(network))]}
     losses, saved, since = [], time.monotonic(), time.monotonic()
@@ -206,7 +209,7 @@ def run(config: Config) -> dict:
             _save(config.out, now, about, history)
     bar.close()
     card = json.loads((config.out / "network.json").read_text())
-    network = files.load(config.out / "network.safetensors", network)
+    network = checkpoints.load(config.out / "network.safetensors", network)
     card["relative_l2"] = _relative_l2(config.method, network, held)
     _write_card(config.out, card)
     print(f"{config.out}: {(time.monotonic() - since) / 60:.1f} min", end=", ")
@@ -215,7 +218,7 @@ def run(config: Config) -> dict:
 
 
 def plot_losses(axes: Axes, losses: dict[str, list], *, title: str) -> None:
-    """Losses of a run against its steps.
+    """Plot a run's losses against its steps.
 
     Args:
         axes: to draw on.
@@ -228,15 +231,15 @@ def plot_losses(axes: Axes, losses: dict[str, list], *, title: str) -> None:
 
 
 def _relative_l2(
-    method: str, network: methods.Network, held: training.Examples
+    method: str, network: recipes.Network, held: training.Examples
 ) -> float:
-    """Geometric mean over frames: what networks of unlike losses are compared by."""
+    """Return the geometric mean over frames, to compare networks of unlike losses."""
     images = objective(method, loss=metrics.rel_l2)
     return float(jnp.exp(jnp.log(training.evaluate(images, network, held)).mean()))
 
 
 def _resume(out: pathlib.Path, about: dict) -> dict:
-    """The losses of a run that is there; none of a new one."""
+    """Return the losses of an existing run; none of a new one."""
     card = out / "network.json"
     if not card.exists():
         return {}
@@ -247,9 +250,9 @@ def _resume(out: pathlib.Path, about: dict) -> dict:
 
 
 def _save(out: pathlib.Path, state: training.State, about: dict, losses: dict) -> None:
-    """The network, its card, the state to go on from, and a plot."""
-    files.save(out / "state.safetensors", state)
-    files.save(out / "network.safetensors", state.network)
+    """Write the network, its card, the state to resume from, and a plot."""
+    checkpoints.save(out / "state.safetensors", state)
+    checkpoints.save(out / "network.safetensors", state.network)
     _write_card(out, about | {"steps": int(state.step), "losses": losses})
     figure, axes = plt.subplots(figsize=(6, 4))
     plot_losses(axes, losses, title=about["method"])
@@ -259,7 +262,7 @@ def _save(out: pathlib.Path, state: training.State, about: dict, losses: dict) -
 
 
 def _write_card(out: pathlib.Path, card: dict) -> None:
-    """At once or not at all."""
+    """Replace the card completely or not at all."""
     temporary = out / "network.json.tmp"
     temporary.write_text(json.dumps(card, indent=1))
     temporary.replace(out / "network.json")

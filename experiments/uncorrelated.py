@@ -114,14 +114,14 @@ def measure(
     windows: tuple[int, ...],
 ) -> dict:
     """Errors of all methods, and every gamma."""
-    scale = 1 / independent.exposure
-    every, z_frame = (f.scaled(scale) for f in (independent, correlated))
-    r, noise = (i * scale for i in reference)
+    every = independent.normalised()
+    z_frame = correlated.normalised(every.unit)
+    r, noise = (i / every.unit for i in reference)
     y_frame = first_half(every)
     y, z, n = y_frame.buffers.color, z_frame.buffers.color, y_frame.samples / 4
     images = {
         "path tracing": every.color,
-        "oidn": every.biased["oidn"].full,
+        "oidn": every.estimates["oidn"].image,
         "common numbers": z_frame.color,
         "both": (y_frame.color + z_frame.color) / 2,
         "uniform": uncorrelated.combine_uniform(y, z),
@@ -134,8 +134,8 @@ def measure(
     )
     for window in windows:
         name = f"uncorrelated {window}x{window}"
-        found = uncorrelated.combine_frames(y_frame, z_frame, window=window)
-        images[name], gammas[name] = found.image, found.gamma
+        images[name] = uncorrelated.combine_frame(y_frame, z_frame, window=window).image
+        gammas[name] = uncorrelated.select_gamma_frame(y_frame, z_frame, window=window)
     gammas["uncorrelated, all rows judged"] = select(y, z, n, stride=1)
     solve = jax.jit(jax.vmap(with_gradients))
     images["L2"] = solve(y_frame.color[None], z_frame.color[None])[0]

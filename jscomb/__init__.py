@@ -1,26 +1,58 @@
 """Combine unbiased and biased Monte Carlo renderings into one better image, in JAX.
 
-Each paper is one module of pure functions, and each has the verb `combine`::
+A frame and its estimates are read, combined and written::
 
-    from jscomb import exr, james_stein
-    frame = exr.read_frame("frame.exr")
-    denoised = frame.biased["oidn"].full
-    image = james_stein.combine(frame.color, denoised, frame.variance)
+    import jax
+    import jscomb
+
+    frame = jscomb.read_frame("frame.exr")
+    estimate = jscomb.combine(jax.random.key(0), frame)
+    jscomb.exr.write_image("combined.exr", estimate.image)
+
+Each paper is one package of pure functions: `james_stein`, `ensemble`,
+`double_shrinkage`, `progressive`, `uncorrelated`. Each has `combine` for arrays and
+`combine_frame` for frames. `methods` lists everything by name.
 """
 
-from jscomb import choice as choice
-from jscomb import denoisers as denoisers
-from jscomb import double_shrinkage as double_shrinkage
-from jscomb import ensemble as ensemble
-from jscomb import exr as exr
-from jscomb import features as features
-from jscomb import frame as frame
-from jscomb import james_stein as james_stein
-from jscomb import learning as learning
-from jscomb import metrics as metrics
-from jscomb import numerics as numerics
-from jscomb import progressive as progressive
-from jscomb import uncorrelated as uncorrelated
-from jscomb.choice import choose as choose
+from jscomb import (
+    denoisers,
+    double_shrinkage,
+    ensemble,
+    exr,
+    features,
+    frame,
+    james_stein,
+    learning,
+    methods,
+    metrics,
+    numerics,
+    progressive,
+    uncorrelated,
+)
+from jscomb.exr import read_frame
+from jscomb.frame import Estimate, Frame, make_frame
+from jscomb.methods import choose, combine
+
+__all__ = [
+    "Estimate",
+    "Frame",
+    "choose",
+    "combine",
+    "denoisers",
+    "double_shrinkage",
+    "ensemble",
+    "exr",
+    "features",
+    "frame",
+    "james_stein",
+    "learning",
+    "make_frame",
+    "methods",
+    "metrics",
+    "numerics",
+    "progressive",
+    "read_frame",
+    "uncorrelated",
+]
 
 __version__ = "0.1.0"

@@ -1,10 +1,10 @@
-"""Features for regression: those that a frame has, without those that tell nothing.
+"""Features for regression: those of a frame, without constant and equal ones.
 
-A regression's cost falls with the square of the number of features. One that is
-constant over the frame has a slope of zero whatever the data, and equal ones share
-theirs; leaving them out changes the result by rounding only, if the one that stays
-takes the ridge divided by the number of its copies. What stays depends on values, so
-`select` is for NumPy at the edge, not for `jit`.
+The cost of a regression grows with the square of the number of features. A feature that
+is constant over the frame gets a slope of zero, and equal ones share a slope; without
+them the result changes by rounding only, if the ridge of a feature is divided by its
+number of copies. The selection depends on values, so `select` runs in NumPy, outside of
+`jit`.
 """
 
 from collections.abc import Sequence
@@ -17,38 +17,40 @@ from jaxtyping import Array, ArrayLike, Float
 from jscomb.frame import Frame
 from jscomb.typing import Image
 
-_ROUNDING = 1e-6  # of the largest value; what a renderer's float32 leaves of a constant
+__all__ = ["Selection", "select", "stack"]
+
+_ROUNDING = 1e-6  # relative to the largest value, for constants in float32
 
 
 class Selection(NamedTuple):
-    """Which channels of a stack of features a regression needs.
+    """The channels of a stack of features that a regression needs.
 
     Attributes:
         channels: their numbers, ascending.
-        copies: how many equal channels each of them stands for.
+        copies: for each, the number of channels equal to it, itself included.
     """
 
     channels: tuple[int, ...]
     copies: tuple[int, ...]
 
     def of(self, features: Float[Array, "h w _"]) -> Float[Array, "h w _"]:
-        """The needed channels, [H,W,F]."""
+        """Return the selected channels, [H,W,F]."""
         return features[..., np.array(self.channels, int)]
 
     def ridge(self, ridge: float) -> Float[np.ndarray, " _"]:
-        """The ridge of each needed channel, [F]; the same result as with its copies."""
+        """Return the ridge of each selected channel, [F], divided by its copies."""
         return ridge / np.array(self.copies, np.float32)
 
 
 def stack(frame: Frame) -> Image:
-    """The features that a frame has, side by side.
+    """Return the features of a frame as channels of one image.
 
     Args:
         frame: with any of albedo, normal, depth and visibility.
 
     Returns:
-        the channels of those it has, in this order, shape [H,W,F], F at most 8. Depth
-        is divided by its largest finite value. F is 0 for a frame without features.
+        the channels of the features that the frame has, in this order, shape [H,W,F], F
+        from 0 to 8. Depth is divided by its largest finite value.
 
     Example:
         >>> from jscomb.frame import make_frame
@@ -75,15 +77,15 @@ def stack(frame: Frame) -> Image:
 
 
 def select(stacks: Sequence[Float[ArrayLike, "h w f"]]) -> Selection:
-    """Leave out channels that are constant, missing, or equal to one before.
+    """Select the channels that are not constant, missing, or equal to an earlier one.
 
     Args:
-        stacks: the same features of each half, shape [H,W,F] each. A channel is left
-            out only if it is constant in all of them, or without any finite value in
-            one. Otherwise pixels that are not finite do not count.
+        stacks: the same features of each half, shape [H,W,F] each. A channel is
+            constant if it is so in all of them, and missing if it has no finite value
+            in one of them. Otherwise pixels that are not finite are ignored.
 
     Returns:
-        what is left.
+        the selected channels.
 
     Example:
         >>> ramp = np.linspace(0, 1, 6).reshape(2, 3)
@@ -114,6 +116,6 @@ def select(stacks: Sequence[Float[ArrayLike, "h w f"]]) -> Selection:
 
 
 def _alike(channel: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two channels differ by rounding only."""
+    """Whether two channels differ only by rounding."""
     largest = np.nanmax(abs(channel), initial=0.0)
     return bool(np.nanmax(abs(channel - other), initial=0.0) <= _ROUNDING * largest)

@@ -1,4 +1,4 @@
-"""Pictures of images beside their errors."""
+"""Pictures of images with their error maps."""
 
 import os
 from collections.abc import Sequence
@@ -7,11 +7,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Array
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2, tone_map
 from jscomb.numerics.guards import finite
 from jscomb.typing import Image
+
+__all__ = ["comparison"]
 
 _ERRORS = (1e-4, 1e0)  # relative squared error from black to white
 
@@ -19,12 +22,12 @@ _ERRORS = (1e-4, 1e0)  # relative squared error from black to white
 def comparison(
     path: str | os.PathLike, frames: Sequence[tuple[Frame, dict[str, Image]]]
 ) -> None:
-    """Write a picture: for each frame a row of images and a row of error maps.
+    """Write a picture: for each frame a row of images above a row of error maps.
 
     Args:
         path: PNG file to write.
-        frames: each a frame with a reference, and combined images of it by name, linear
-            radiance, [H,W,3]. The frame's colour and biased images stand before them.
+        frames: each a frame with a reference, and further images of it by name, linear
+            radiance, [H,W,3]. The frame's colour and estimates are shown before them.
 
     Returns:
         nothing.
@@ -37,7 +40,7 @@ def comparison(
         >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> grey = jnp.full((4, 4, 3), 0.2)
-        >>> frame = make_frame(grey, biased={"denoised": grey}, reference=grey)
+        >>> frame = make_frame(grey, estimates={"denoised": grey}, reference=grey)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     comparison(f"{folder}/errors.png", [(frame, {"combined": grey})])
         ...     print(os.listdir(folder))
@@ -49,7 +52,7 @@ def comparison(
             raise ValueError("a comparison needs a frame with a reference")
         spp = "" if frame.samples is None else f", {float(frame.samples):.0f} spp"
         inputs = {f"path tracing{spp}": frame.color}
-        inputs |= {name: image.full for name, image in frame.biased.items()}
+        inputs |= {name: image.image for name, image in frame.estimates.items()}
         rows.append((frame.reference, inputs | combined))
     columns = 1 + max(len(images) for _, images in rows)
     figure, axes = plt.subplots(
@@ -80,16 +83,16 @@ def comparison(
 
 
 def _show(axis: Axes, image: Array, title: str) -> None:
-    """An image as a display shows it."""
+    """Show a tone-mapped image."""
     axis.imshow(np.asarray(tone_map(image)), interpolation="nearest")
     axis.set_title(title, fontsize=9)
 
 
 def _show_error(axis: Axes, image: Array, reference: Array, title: str) -> None:
-    """Relative squared error of each pixel, logarithmic."""
+    """Show the relative squared error of each pixel on a logarithmic scale."""
     square = np.mean((np.asarray(image) - reference) ** 2, axis=-1)
     relative = square / (np.mean(reference, axis=-1) ** 2 + 0.01)
-    low, high = np.log10(_ERRORS)
-    shown = np.log10(np.maximum(relative, 1e-30))
-    axis.imshow(shown, cmap="magma", vmin=low, vmax=high, interpolation="nearest")
+    shown = np.maximum(relative, _ERRORS[0])  # 0 would be transparent
+    norm = LogNorm(*_ERRORS)
+    axis.imshow(shown, cmap="magma", norm=norm, interpolation="nearest")
     axis.set_title(title, fontsize=9)

@@ -3,6 +3,8 @@
 from jaxtyping import Array, Bool, Float
 from jaxtyping import Key as _Key
 
+__all__ = ["Image", "Key", "Mask", "Scalar", "Variance"]
+
 Image = Float[Array, "h w c"]
 """Linear scene-referred radiance, or a feature."""
 
@@ -10,7 +12,7 @@ Variance = Float[Array, "h w c"]
 """Squared radiance, of the mean, never of one sample."""
 
 Mask = Bool[Array, "h w 1"]
-"""True where a pixel takes part."""
+"""True at the pixels that count."""
 
 Scalar = Float[Array, ""]
 """One number."""

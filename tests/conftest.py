@@ -121,12 +121,12 @@ def folder(glass_frame, tmp_path):
     arrays = {
         "reference": glass_frame.reference.image,
         "reference_half_difference": glass_frame.reference.half_difference,
-        "full_oidn_32": glass_frame.biased["oidn"].full,
+        "full_oidn_32": glass_frame.estimates["oidn"].image,
     }
     for name, half in zip("ab", glass_frame.halves(), strict=True):
         arrays[f"{name}_color_32"] = half.color
         arrays[f"{name}_variance_32"] = half.variance
-        arrays[f"{name}_oidn_32"] = half.biased["oidn"].full
+        arrays[f"{name}_oidn_32"] = half.estimates["oidn"].image
         for feature, channels in CHANNELS.items():
             image = getattr(half, feature)
             arrays[f"{name}_{feature}"] = image[..., 0] if channels == 1 else image

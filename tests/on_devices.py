@@ -1,4 +1,6 @@
-"""Run by test_crops: a combiner on four devices, of one process or of two.
+"""Compare a combiner on four devices, of one process or of two, with one device.
+
+Run by test_crops:
 
 python -m tests.on_devices [PROCESS COUNT ADDRESS]
 """
@@ -11,19 +13,20 @@ import numpy as np
 
 from jscomb import james_stein
 from jscomb.numerics import tiles
+from jscomb.numerics.windows import reach_of
 
-HALO = 15  # windows of 7x7 about centres in windows of 7x7, variance of 19x19
+HALO = reach_of(7, 7, 19)  # the statistics, the mean over windows, the variance
 
 
 def combine(images):
-    """Whitened."""
+    """Combine, whitened."""
     x, y, v = images
     robust = james_stein.robust_variance(v)
     return james_stein.combine(x, y, robust, window=7, whiten=True)
 
 
 def main(height: int) -> None:
-    """Print the largest difference to one device, of the image and a derivative."""
+    """Print the largest differences: of the image, and of three derivatives."""
     rng = np.random.default_rng(0)
     x, y, v = (rng.gamma(1.0, size=(height, 50, 3)) for _ in range(3))
     x[20, 20] = np.nan
@@ -34,10 +37,10 @@ def main(height: int) -> None:
         np.asarray(jax.experimental.multihost_utils.process_allgather(a, tiled=True))
         for a in jax.tree.leaves(tree)
     ]
-    made = [sharded(images), jax.grad(square(sharded))(images)]
-    wanted = [jax.jit(combine)(images), jax.jit(jax.grad(square(combine)))(images)]
-    for got, want in zip(gather(made), jax.tree.leaves(wanted), strict=True):
-        print(float(np.max(np.abs(got - np.asarray(want)))))
+    found = [sharded(images), jax.grad(square(sharded))(images)]
+    expected = [jax.jit(combine)(images), jax.jit(jax.grad(square(combine)))(images)]
+    for a, b in zip(gather(found), jax.tree.leaves(expected), strict=True):
+        print(float(np.max(np.abs(a - np.asarray(b)))))
 
 
 if __name__ == "__main__":

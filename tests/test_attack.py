@@ -1,4 +1,4 @@
-"""The corpus of hostile files, and that its judge can tell."""
+"""The corpus of hostile files, and whether its verdicts are right."""
 
 import contextlib
 import os
@@ -67,8 +67,8 @@ def leak(path, limit):
         (attack.read, "right image"),
     ],
 )
-def test_the_judge_can_tell(tmp_path, read, outcome):
-    """And goes on after a crash or a hang."""
+def test_verdicts_are_right(tmp_path, read, outcome):
+    """The worker continues after a crash or a hang."""
     frame = hostile.own_frame(0)
     data = hostile.own_bytes(frame, tmp_path)
     case = hostile.Case("file", data, hostile.arrays(frame))
@@ -79,14 +79,14 @@ def test_the_judge_can_tell(tmp_path, read, outcome):
 
 
 def write_in_place(path, seed):
-    """As the binding does: over the file, which is then cut off."""
+    """Overwrite the file, as the binding does, and leave it truncated."""
     data = hostile.own_bytes(hostile.own_frame(seed), pathlib.Path(path).parent)
     with open(path, "wb") as file:
         file.write(data[:-1])
 
 
 def write_in_vain(path, seed):
-    """A failure that leaves something behind."""
+    """Fail, and leave a temporary file behind."""
     with open(f"{path}.tmp", "wb"):
         raise OSError(f"{path}: no space left")
 

@@ -8,8 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from jscomb import choice, exr, metrics
-from jscomb.frame import Biased
+from jscomb import exr, metrics
+from jscomb.cli._showing import SHOWN
+from jscomb.frame import Estimate
+from jscomb.methods import BASES, CANDIDATES, METHODS
 from jscomb.numerics.guards import finite
 from tests.conftest import DATA
 from tests.test_exr import layer, noise, write
@@ -27,53 +29,54 @@ def test_demo(jscomb, tmp_path):
     status, out, _ = jscomb("demo", "--out", tmp_path / "demo")
     assert status == 0
     few, many = errors_in(out, 0), errors_in(out, 1)
-    methods = {"path tracing", "chosen", *choice.METHODS}
+    methods = {"path tracing", "chosen", *SHOWN}
     assert few.keys() == many.keys() == methods
     assert all(many[name] < few[name] for name in methods)
-    assert few["chosen"] in [few[name] for name in choice.METHODS]
-    assert few["chosen"] < few["kept"]
-    assert many["chosen"] < many["kept"]
+    assert few["chosen"] in [few[name] for name in SHOWN]
+    assert few["chosen"] < few["denoised"]
+    assert many["chosen"] < many["denoised"]
     assert {p.name for p in (tmp_path / "demo").iterdir()} == {
         "comparison.png",
-        *(f"cornell-glass-{n}-{m}.exr" for n in (64, 1024) for m in choice.METHODS),
+        *(f"cornell-glass-{n}-{m}.exr" for n in (64, 1024) for m in SHOWN),
     }
     assert os.fspath((tmp_path / "demo").resolve()) in out
 
 
-@pytest.mark.parametrize("method", ["auto", *choice.METHODS])
+@pytest.mark.parametrize("method", ["auto", *SHOWN, "bilateral", "ensemble"])
 def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     path = tmp_path / "out.exr"
     status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)
     assert status == 0
     if method == "auto":
         said = re.findall(
-            r"half buffers, (\w+) +adds ([-+][\d.e-]+) \+- [\d.e-]+ rel", out
+            r"^(\w+): estimated change of relative L2 ([-+][\d.e-]+) ±", out, re.M
         )
         changes = {name: float(change) for name, change in said}
-        assert changes.keys() == set(choice.CANDIDATES) - {choice.KEEP}
-        method = re.search(r"oidn (\w+)$", out, re.M)[1]
+        assert changes.keys() == set(CANDIDATES) - {"denoised"}
+        method = re.search(r"(\w+) of oidn$", out, re.M)[1]
         assert changes[method] < 0.9 * min(changes.values())
     image = exr.read_image(path)
     r, noise = glass_frame.reference
     error = float(metrics.rel_l2(image, r, half_difference=noise))
     np.testing.assert_allclose(errors_in(out)[method], error, atol=6e-6)
     about = exr.read_provenance(path)
-    assert (about["method"], about["biased"]) == (method, "oidn")
+    bases = {"bilateral": [], "ensemble": ["oidn", *BASES[1:]]}
+    assert (about["method"], about["biased"]) == (method, bases.get(method, ["oidn"]))
     assert about["input"]["scene"] == "cornell-glass"
 
 
-def test_combine_keeps_what_it_cannot_better(jscomb, tmp_path, glass_frame):
+def test_combine_keeps_a_perfect_image(jscomb, tmp_path, glass_frame):
     """A biased image that is the truth can only be harmed, and the halves tell."""
     truth = glass_frame.reference.image
-    frame = glass_frame._replace(biased={})
-    perfect = frame.with_biased("perfect", Biased(truth, np.stack([truth, truth])))
+    frame = glass_frame._replace(estimates={})
+    perfect = frame.with_estimate("perfect", Estimate(truth, np.stack([truth, truth])))
     exr.write_frame(tmp_path / "f.exr", perfect)
     status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
     assert status == 0
-    assert re.search("by the half buffers, whitened +adds", out)
-    assert "perfect kept" in out
+    assert "whitened: estimated change of relative L2 " in out
+    assert "denoised of perfect" in out
     np.testing.assert_array_equal(exr.read_image(tmp_path / "o.exr"), truth)
-    assert exr.read_provenance(tmp_path / "o.exr")["method"] == "kept"
+    assert exr.read_provenance(tmp_path / "o.exr")["method"] == "denoised"
 
 
 def test_combine_with_a_file(jscomb, tmp_path, glass_frame):
@@ -83,8 +86,8 @@ def test_combine_with_a_file(jscomb, tmp_path, glass_frame):
         "combine", GLASS, "--biased", biased, "--out", tmp_path / "out.exr"
     )
     assert status == 0
-    assert "flat.exr whitened" in out
-    assert "it is not known whether this helps" in out
+    assert "whitened of flat.exr" in out
+    assert "whitened: without half buffers of the frame and the biased" in out
     named = jscomb("combine", GLASS, "--biased", "oidn", "-o", tmp_path / "named.exr")
     assert named[0] == 0
 
@@ -101,7 +104,7 @@ def test_combine_denoises_what_is_not(jscomb, tmp_path, glass_frame):
     frame = write(tmp_path / "pbrt.exr", channels, samplesPerPixel=64)
     status, out, _ = jscomb("combine", frame, "-o", tmp_path / "out.exr")
     assert status == 0
-    assert "oidn whitened" in out
+    assert "whitened of oidn" in out
     r, noise = f.reference
     status, out, _ = jscomb("compare", tmp_path / "out.exr", GLASS)
     expected = float(
@@ -119,9 +122,9 @@ def test_compare(jscomb, tmp_path):
     b = write(tmp_path / "b.exr", layer("", np.nan_to_num(image, nan=1.0)))
     status, out, _ = jscomb("compare", a, b)
     assert status == 0
-    assert "1 of 400 pixels are not finite and were left out" in out
+    assert "1 of 400 pixels are not finite and were excluded" in out
     assert re.search(r"relative L2 +0$", out, re.M)
-    assert "FLIP  not measured: image must have pixels and be finite" in out
+    assert "FLIP  skipped: image must have pixels and be finite" in out
     status, out, _ = jscomb("compare", b, b)
     assert re.search(r"HDR-FLIP +0$", out, re.M)
 
@@ -164,10 +167,10 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
     exr.write_frame(tmp_path / "f.exr", glass_frame._replace(buffers=buffers))
     status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
     assert status == 0
-    assert "25 of 4096 pixels are not finite and were left out" in out
+    assert "25 of 4096 pixels are not finite and were excluded" in out
     r, noise = glass_frame.reference
     mask = finite(color[0])
-    y = glass_frame.biased["oidn"].full
+    y = glass_frame.estimates["oidn"].image
     error = metrics.rel_l2(y, r, half_difference=noise, mask=mask)
     np.testing.assert_allclose(errors_in(out)["oidn"], float(error), atol=6e-6)
 
@@ -176,7 +179,10 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
     ("arguments", "message"),
     [
         (["combine", "f.exr"], "-o PATH"),
-        (["combine", "f.exr", "-o", "o.exr", "--method", "median"], "'median'"),
+        (
+            ["combine", "f.exr", "-o", "o.exr", "--method", "median"],
+            "--method median: exp",
+        ),
         (["demo", "--nope"], "--nope"),
         (["frobnicate"], "frobnicate"),
         ([], "demo, combine, compare, info"),
@@ -195,9 +201,9 @@ def test_help_reads_well(jscomb):
         assert status == 0
         assert "usage: jscomb" in out
         assert "{None}" not in out
-    assert (
-        "{auto,kept,james-stein,whitened,njs,pd,dsc}" in jscomb("combine", "--help")[1]
-    )
+    shown = " ".join(jscomb("combine", "--help")[1].split())
+    for name, method in METHODS.items():
+        assert f"{name} ({method.summary})" in shown
 
 
 def truncated(folder):
@@ -218,20 +224,32 @@ def moments(folder):
 
 def several(folder):
     frame = exr.read_frame(GLASS)
-    exr.write_frame(folder / "two.exr", frame.with_biased("other", frame.color))
+    exr.write_frame(folder / "two.exr", frame.with_estimate("other", frame.color))
     return folder / "two.exr"
 
 
 BAD = {
     "truncated": (truncated, [], r"cut\.exr: truncated or corrupt"),
     "missing": (lambda d: d / "no.exr", [], r"no\.exr: no such file"),
-    "directory": (lambda d: d, [], "holds neither color.exr nor colorA.exr"),
-    "no variance": (without_statistics, [], r"plain\.exr: .*neither variance nor"),
+    "directory": (lambda d: d, [], "has neither color.exr nor colorA.exr"),
+    "no variance": (
+        without_statistics,
+        ["--method", "whitened"],
+        r"plain\.exr: whitened needs the variance: render with variances, or",
+    ),
     "no samples": (moments, [], r"moments\.exr: .*give the samples a pixel"),
-    "several": (several, [], r"two\.exr holds several biased images.*oidn, other"),
+    "several": (
+        several,
+        [],
+        r"two\.exr: which biased image\? this frame has oidn, other",
+    ),
     "count": (lambda d: GLASS, ["--samples", "-5"], "samples must be at least 1"),
-    "biased": (lambda d: GLASS, ["--biased", "nlm"], "neither a file nor a biased"),
-    "no image": (lambda d: GLASS, ["--biased", os.fspath(DATA)], "holds neither"),
+    "biased": (
+        lambda d: GLASS,
+        ["--biased", "nlm"],
+        "neither a file, nor a denoiser, nor a biased",
+    ),
+    "no image": (lambda d: GLASS, ["--biased", os.fspath(DATA)], "has neither"),
 }
 
 

@@ -14,10 +14,10 @@ import pytest
 from experiments import catalogue, parts
 from experiments.rendering import Rendering, mirrored, rendering_of
 from jscomb import (
-    choice,
     double_shrinkage,
     ensemble,
     james_stein,
+    methods,
     progressive,
     uncorrelated,
 )
@@ -265,20 +265,51 @@ def test_tiled_is_untiled(function, plain):
 
 
 ELSEWHERE = {
-    "of frames, and decides on values": {
-        "bilateral.denoise_frame",
-        "choice.choose",
-        "choice.combine",
-        "choice.local",
+    "of frames, and what they are made of is here": {
+        *(
+            f"{room}.{name}"
+            for room in ("bilateral", "nonlocal_means", "rdfc", "smoothing")
+            for name in ("denoise_frame", "plan_frame", "reach")
+        ),
         "double_shrinkage.combine_frame",
+        "double_shrinkage.make_inputs",
+        "double_shrinkage.neural_combine_frame",
+        "double_shrinkage.neural_inputs",
+        "double_shrinkage.plan_neural",
+        "ensemble.combine_frame",
         "ensemble.select_bases",
-        "ensemble.stack_bases",
+        "ensemble.stack_estimates",
+        "james_stein.combine_frame",
+        "james_stein.neural_combine_frame",
+        "james_stein.neural_inputs",
+        "james_stein.plan_frame",
+        "james_stein.plan_neural",
+        "james_stein.reach",
         "james_stein.regress",
         "james_stein.worth_regressing",
+        "kernel_predicting.denoise_inputs",
+        "kernel_predicting.neural_inputs",
+        "methods.choose",
+        "methods.combine",
+        "methods.input_name",
+        "methods.inputs",
+        "methods.table",
         "nfor.denoise_frame",
+        "oidn.denoise_color",
         "oidn.denoise_frame",
-        "rdfc.denoise_frame",
-        "uncorrelated.combine_frames",
+        "progressive.combine_frame",
+        "progressive.neural_combine_frame",
+        "progressive.neural_inputs",
+        "progressive.plan_neural",
+        "uncorrelated.combine_frame",
+        "uncorrelated.select_gamma_frame",
+    },
+    "what is here with normalisation, or without": {
+        "double_shrinkage.neural_combine",
+        "james_stein.neural_combine",
+        "kernel_predicting.denoise",
+        "oidn.denoise_normalised",
+        "progressive.neural_combine",
     },
     "of functions": {
         "nonlocal_means.weights",
@@ -299,7 +330,7 @@ MODULES = [
     uncorrelated,
     double_shrinkage,
     progressive,
-    choice,
+    methods,
     bilateral,
     kernel_predicting,
     nfor,
@@ -320,12 +351,11 @@ def test_nothing_is_left_out():
     public = {
         f"{short(module)}.{name}"
         for module in MODULES
-        for name, found in inspect.getmembers(module, inspect.isfunction)
-        if found.__module__.startswith(module.__name__) and name[0] != "_"
+        for name in module.__all__
+        if inspect.isfunction(found := getattr(module, name))
+        and found.__module__.startswith(module.__name__)
     }
-    here = {name.partition(" ")[0] for name in ENTRIES} - {
-        f"choice.{method}" for method in choice.UNTRAINED
-    }
+    here = {name.partition(" ")[0] for name in ENTRIES}
     named = here | parts.parts().keys() | set().union(*ELSEWHERE.values())
     assert public <= named
     assert here | set().union(*ELSEWHERE.values()) <= public

@@ -19,7 +19,7 @@ RNG = np.random.default_rng(0)
 
 
 def blocks(image):
-    """Not local to a pixel but to blocks of four: their mean, everywhere in them."""
+    """The mean of each block of four by four pixels, everywhere in the block."""
     h, w, c = image.shape
     padded = jnp.pad(image, [(0, -h % 4), (0, -w % 4), (0, 0)])
     mean = padded.reshape(padded.shape[0] // 4, 4, -1, 4, c).mean((1, 3))
@@ -64,7 +64,7 @@ def test_gradients_go_through_crops():
 
 
 def test_a_budget_is_kept():
-    """Also by what the program of the found tile takes."""
+    """By the compiled program of the tile, too."""
     image = jax.ShapeDtypeStruct((600, 500, 3), jnp.float32)
     local = lambda i: window_sum(jnp.square(i), 15)
     whole = tiles.tile_within(local, image, halo=7, budget=2**40)
@@ -74,9 +74,9 @@ def test_a_budget_is_kept():
     assert 16 < tile < 600
     crop = jax.ShapeDtypeStruct((tile + 14, tile + 14, 3), jnp.float32)
     used = jax.jit(local).lower(crop).compile().memory_analysis()
-    of_crop = 2 * 4 * 3 * (tile + 14) ** 2  # the image and its sums
-    assert of_crop <= used.temp_size_in_bytes + of_crop <= budget
-    assert of_crop > budget / 8  # nor is it much smaller than it might be
+    crop_bytes = 2 * 4 * 3 * (tile + 14) ** 2  # the image and its sums
+    assert crop_bytes <= used.temp_size_in_bytes + crop_bytes <= budget
+    assert crop_bytes > budget / 8  # not much smaller than possible
     with pytest.raises(ValueError, match="the budget is 0 MiB"):
         tiles.tile_within(local, image, halo=7, budget=1000)
 
@@ -88,8 +88,44 @@ def test_bad_crops_are_named(wrong):
         tiles.crops((8, 8), **options)
 
 
+def test_a_function_of_the_whole_image_is_not_cut():
+    image, double = jnp.ones((4, 4, 1)), lambda image: 2 * image
+    local = tiles.Local(double, image, None)
+    np.testing.assert_array_equal(local.whole(), 2 * image)
+    for cut in (
+        lambda: tiles.crops(image.shape, tile=2, halo=None),
+        lambda: tiles.map_crops(double, image, tile=2, halo=local.halo),
+        lambda: next(tiles.stream_crops(double, image, tile=2, halo=local.halo)),
+        lambda: tiles.map_shards(double, image, halo=local.halo),
+        lambda: tiles.tile_within(double, image, halo=local.halo, budget=2**20),
+    ):
+        with pytest.raises(ValueError, match=r"^.* whole image .*: combine it whole$"):
+            cut()
+
+
+def test_equal_options_share_one_program():
+    traces = []
+
+    def scaled(image, *, factor, shift):
+        traces.append(factor)
+        return factor * image + shift
+
+    image = jnp.ones((2, 3, 1))
+    program = tiles.compiled(scaled, factor=2, shift=1)
+    assert tiles.compiled(scaled, shift=1, factor=2) is program
+    for _ in range(3):
+        again = tiles.compiled(scaled, factor=2, shift=1)
+        np.testing.assert_array_equal(again(image), 3 * image)
+    assert traces == [2]
+    assert program._cache_size() == 1
+    other = tiles.compiled(scaled, factor=5, shift=1)
+    assert other is not program
+    np.testing.assert_array_equal(other(image), 6 * image)
+    assert traces == [2, 5]
+
+
 def differences(*arguments, devices):
-    """What `on_devices` prints, begun; a process of so many devices."""
+    """Start `on_devices` in a process that has so many devices."""
     flags = f"--xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
         [sys.executable, "-m", "tests.on_devices", *arguments],
@@ -102,8 +138,8 @@ def differences(*arguments, devices):
 
 def check(process):
     """The image and three derivatives are those of one device."""
-    out, said = process.communicate(timeout=300)
-    assert process.returncode == 0, said
+    out, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
     numbers = [float(line) for line in out.split("\n") if "e-" in line or line == "0.0"]
     assert len(numbers) == 4
     assert max(numbers) < 1e-12

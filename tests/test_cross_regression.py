@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import features, james_stein
-from jscomb.frame import Biased, make_frame
+from jscomb.frame import Estimate, make_frame
 from tests.statistics import assert_mean
 from tests.test_regression import gaussian, oracle
 
@@ -181,52 +181,58 @@ def textured(noise):
         albedo=albedo,
         reference=albedo,
     )
-    return frame.with_biased("blurred", Biased(blurred.mean(0), jnp.asarray(blurred)))
+    return frame.with_estimate(
+        "blurred", Estimate(blurred.mean(0), jnp.asarray(blurred))
+    )
+
+
+def regress(frame, name="blurred", *, window=9):
+    """One of a frame's estimates."""
+    y = frame.estimates[name]
+    return james_stein.regress(jax.random.key(0), frame, y, window=window)
 
 
 def test_regresses_where_features_explain_the_radiance():
-    frame = textured(0.1)
-    done = james_stein.regress(jax.random.key(0), frame, "blurred", window=9)
+    frame = textured(0.1).normalised()
+    done = regress(frame)
     assert done.ran
     error = lambda image: float(jnp.mean((image - frame.reference.image) ** 2))
-    old, new = error(frame.biased["blurred"].full), error(done.biased.full)
+    old, new = error(frame.estimates["blurred"].image), error(done.estimate.image)
     assert new < 0.2 * old
-    assert done.biased.halves.shape == (2, 40, 40, 3)
+    assert done.estimate.halves.shape == (2, 40, 40, 3)
 
 
 def test_leaves_a_perfect_image_alone():
     frame = textured(0.3)
     truth = frame.reference.image
-    frame = frame.with_biased("truth", Biased(truth, jnp.stack([truth, truth])))
-    done = james_stein.regress(jax.random.key(0), frame, "truth", window=9)
+    frame = frame.with_estimate("truth", Estimate(truth, jnp.stack([truth, truth])))
+    frame = frame.normalised()
+    done = regress(frame, "truth")
     assert not done.ran
-    assert done.biased is frame.biased["truth"]
+    assert done.estimate is frame.estimates["truth"]
     assert done.change.mean > 0
 
 
 def test_regress_is_scale_equivariant():
     frame = textured(0.1)
-    regress = lambda f: james_stein.regress(jax.random.key(0), f, "blurred", window=9)
-    one = regress(frame)
+    one = regress(frame.normalised())
     for scale in (1e-4, 1e5):
-        other = regress(frame.scaled(scale))
-        np.testing.assert_allclose(
-            other.biased.full, scale * one.biased.full, rtol=1e-8
-        )
+        other = regress(frame.scaled(scale).normalised())
+        np.testing.assert_allclose(other.estimate.image, one.estimate.image, rtol=1e-8)
         np.testing.assert_allclose(other.change.mean, one.change.mean, rtol=1e-6)
 
 
 def test_regress_with_few_features_and_narrow_windows():
     frame = textured(0.1)
     bare = frame._replace(buffers=frame.buffers._replace(albedo=None))
-    done = james_stein.regress(jax.random.key(0), bare, "blurred", window=3)
+    done = regress(bare.normalised(), window=3)
     assert np.isfinite(done.change.mean)
 
 
 def test_regress_without_given_variance():
     frame = textured(0.1)
     frame = frame._replace(buffers=frame.buffers._replace(variance=None))
-    assert james_stein.regress(jax.random.key(0), frame, "blurred", window=9).ran
+    assert regress(frame.normalised()).ran
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -240,5 +246,11 @@ def test_bad_input():
         james_stein.worth_regressing(
             jax.random.key(0), *images[:5], images[5][:9], *images[:2]
         )
-    with pytest.raises(ValueError, match="no biased image 'oidn' with halves"):
-        james_stein.regress(jax.random.key(0), textured(0.1), "oidn")
+    frame = textured(0.1)
+    with pytest.raises(ValueError, match=r"regress needs a normalised frame: call"):
+        regress(frame)
+    without = frame.with_estimate("blurred", frame.color).normalised()
+    with pytest.raises(ValueError, match=r"regress needs an estimate with halves"):
+        regress(without)
+    with pytest.raises(ValueError, match=r"regress needs half buffers: render at le"):
+        regress(frame.merged(1).normalised())

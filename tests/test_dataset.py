@@ -69,7 +69,7 @@ def test_a_dataset_is_made_once(tmp_path, vectorised, capsys):
     assert a.half_difference is not None
     for frame in frames:
         assert frame.sub_buffers == 2
-        assert frame.biased["oidn"].halves.shape == (2, 16, 16, 3)
+        assert frame.estimates["oidn"].halves.shape == (2, 16, 16, 3)
         assert frame.buffers.variance is not None
         assert frame.visibility is not None
     times = [file.stat().st_mtime_ns for file in files]

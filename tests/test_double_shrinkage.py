@@ -1,5 +1,8 @@
 """Double shrinkage against loops and Bayes, and what it is told of errors."""
 
+import functools
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +11,10 @@ from jax.test_util import check_grads
 
 from jscomb import double_shrinkage
 from jscomb.features import stack
-from jscomb.frame import make_frame
+from jscomb.frame import Estimate, make_frame, with_halves
+from jscomb.numerics.kernels import Kernels
+from jscomb.numerics.tiles import map_crops
+from jscomb.numerics.windows import window_mean
 from tests.statistics import assert_mean, assert_mean_below
 
 combine = jax.jit(double_shrinkage.combine)
@@ -119,7 +125,7 @@ def test_a_bad_pixel_stays_local(which):
 
 def test_bad_input(unchecked):
     p, u, b, v, m, eta = images()
-    with pytest.raises(ValueError, match="mse must be at least zero, its least is -"):
+    with pytest.raises(ValueError, match="mse must be at least zero, its minimum is -"):
         double_shrinkage.combine(p, u, b, v, -m, eta)
     with pytest.raises(ValueError, match=r"mse must have shape .*\(6, 7, 3\): None"):
         double_shrinkage.combine(p, u, b, v, None, eta)
@@ -365,52 +371,143 @@ def test_confidence_leaves_bad_pixels_out():
 
 
 def test_a_frame_is_made_of_the_parts(glass_frame):
-    """At an exposure of one, features without those that tell nothing."""
-    frame = glass_frame._replace(reference=None)
-    found = double_shrinkage.combine_frame(frame, "oidn", window=9, stride=1)
-    e = frame.exposure
+    """Of normalised radiance, with the features that are not constant."""
+    raw = glass_frame._replace(reference=None)
+    frame, options = raw.normalised(), {"window": 9, "stride": 1}
+    y = frame.estimates["oidn"]
+    found = double_shrinkage.combine_frame(frame, y, **options).image
     a, b = frame.halves()
-    u, y = frame.color / e, frame.biased["oidn"]
-    v = double_shrinkage.unbiased_error(u, y.full / e, frame.variance / e**2)
-    m = double_shrinkage.biased_error(*(i / e for i in (a.color, b.color, *y.halves)))
+    u = frame.color
+    v = double_shrinkage.unbiased_error(u, y.image, frame.variance)
+    m = double_shrinkage.biased_error(a.color, b.color, *y.halves)
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
     features = stack(frame)
     first = double_shrinkage.factors(v, m, 0 * v)
-    x1, s = first.blend(u, y.full / e), one(first.error)
+    x1, s = first.blend(u, y.image), one(first.error)
     p = prior(x1, x1, s, s, features, window=9)
-    eta = double_shrinkage.confidence(p, u, y.full / e, v, m)
-    expected = e * combine(p, u, y.full / e, v, m, eta)
-    np.testing.assert_allclose(found.image, expected, rtol=2e-3, atol=1e-3 * e)
-    np.testing.assert_allclose(found.mse, e**2 * m, rtol=1e-4)
-    assert np.all((found.prior_share >= 0) & (found.prior_share <= 1))
-    bright = double_shrinkage.combine_frame(
-        frame.scaled(1e3), "oidn", window=9, stride=1
+    eta = double_shrinkage.confidence(p, u, y.image, v, m)
+    expected = combine(p, u, y.image, v, m, eta)
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-3)
+    inputs = double_shrinkage.make_inputs(frame, y, **options)
+    np.testing.assert_array_equal(combine(*inputs), found)
+    np.testing.assert_allclose(inputs.mse, m, rtol=1e-4)
+    share = double_shrinkage.factors(*inputs[3:]).prior
+    assert np.all((share >= 0) & (share <= 1))
+    bright = raw.scaled(1e3).normalised()
+    bright = double_shrinkage.combine_frame(bright, bright.estimates["oidn"], **options)
+    np.testing.assert_allclose(bright.image, found, rtol=1e-3, atol=1e-3)
+
+
+def smoothed(frame):
+    """A frame and its halves, averaged over windows."""
+    return with_halves(frame, lambda part: window_mean(part.color, 3))
+
+
+def test_halves_of_a_frame_are_the_halves_combined(glass_frame):
+    """By a maker, which sees each half alone; not by an estimate of both halves."""
+    frame, options = glass_frame.normalised(), {"window": 9, "stride": 1}
+    found = double_shrinkage.combine_frame(frame, smoothed, **options)
+    given = double_shrinkage.combine_frame(frame, smoothed(frame), **options)
+    np.testing.assert_array_equal(given.image, found.image)
+    assert given.halves is None
+    for half, image in zip(frame.halves(), found.halves, strict=True):
+        alone = double_shrinkage.combine_frame(half, smoothed(half), **options)
+        np.testing.assert_array_equal(image, alone.image)
+    two = frame.merged(2)
+    assert double_shrinkage.combine_frame(two, smoothed, **options).halves is None
+
+
+class Pooling(NamedTuple):
+    """A network of one parameter, which sees less far than its kernels."""
+
+    rate: jax.Array
+    reach, multiple = 1, 1
+
+    def __call__(self, p, u, b, v, m):
+        """Narrower kernels and more confidence where the images differ."""
+        width, differences = 2 * self.reach + 1, jnp.mean(abs(u - b), -1, keepdims=True)
+        features = self.rate * window_mean(differences, width)
+        steps = jnp.linspace(0, 1, 2 * 13**2, dtype=features.dtype)
+        head = lambda near: jnp.exp(-near * steps[None, None])
+        return double_shrinkage.Filters(Kernels(features, head, 0), features)
+
+
+class Wide(Pooling):
+    """One that sees farther than its kernels."""
+
+    reach = 9
+
+
+def test_a_frame_by_a_network(glass_frame):
+    """The same as by arrays; halves are the halves combined."""
+    frame, network = glass_frame.normalised(), Pooling(jnp.float32(2.0))
+    found = double_shrinkage.neural_combine_frame(network, frame, smoothed)
+    inputs = double_shrinkage.neural_inputs(frame, smoothed(frame))
+    expected = double_shrinkage.neural_combine(network, **inputs)
+    np.testing.assert_allclose(found.image, expected, rtol=1e-4, atol=1e-5)
+    half = frame.halves()[1]
+    alone = double_shrinkage.neural_combine_frame(network, half, smoothed(half))
+    np.testing.assert_array_equal(found.halves[1], alone.image)
+
+
+@pytest.mark.parametrize(("kind", "halo"), [(Pooling, 6), (Wide, 9)])
+def test_a_frame_by_crops(kind, halo, glass_frame):
+    """The halo is exact: a pixel less is too little."""
+    frame, network = glass_frame.normalised(), kind(jnp.float32(2.0))
+    plan = double_shrinkage.plan_neural(network, frame, smoothed(frame))
+    assert (plan.halo, plan.multiple) == (halo, 1)
+    whole = plan.whole()
+    cut, short = (
+        map_crops(plan.function, plan.images, tile=20, halo=around)
+        for around in (halo, halo - 1)
     )
-    np.testing.assert_allclose(bright.image, 1e3 * found.image, rtol=1e-3, atol=e)
+    np.testing.assert_allclose(cut, whole, rtol=1e-6)
+    assert np.max(abs(short - whole)) > 1e-4
 
 
-def test_frames_without_what_it_takes(glass_frame):
-    alone = glass_frame.with_biased("photons", glass_frame.color)
-    for name in ("photons", "caustics"):
-        with pytest.raises(
-            ValueError, match=rf"no biased image '{name}' with halves; "
-        ):
-            double_shrinkage.combine_frame(alone, name)
+def test_a_network_without_reach(glass_frame):
+    network = lambda *given: Pooling(jnp.float32(1.0))(*given)
+    frame = glass_frame.normalised()
+    plan = double_shrinkage.plan_neural(network, frame, smoothed(frame))
+    assert plan.halo is None
+    assert np.isfinite(plan.whole()).all()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        double_shrinkage.combine_frame,
+        functools.partial(double_shrinkage.neural_combine_frame, lambda *_: None),
+    ],
+)
+def test_frames_without_what_it_takes(call, glass_frame):
+    frame = glass_frame.normalised()
+    with pytest.raises(ValueError, match="double_shrinkage needs an estimate with hal"):
+        call(frame, Estimate(frame.color))
+    with pytest.raises(ValueError, match=r"double_shrinkage needs .*\.normalised\(\)"):
+        call(glass_frame, glass_frame.estimates["oidn"])
+    with pytest.raises(ValueError, match="double_shrinkage needs half buffers: render"):
+        call(frame.merged(1), frame.estimates["oidn"])
 
 
 def test_ugly_frames(glass_frame):
     """A bad pixel in either image keeps to itself; features are optional."""
     color = glass_frame.buffers.color.at[0, 20, 30].set(jnp.nan)
-    photons = glass_frame.biased["oidn"]
-    photons = photons._replace(full=photons.full.at[40, 9].set(jnp.inf))
+    photons = glass_frame.estimates["oidn"]
+    photons = photons._replace(image=photons.image.at[40, 9].set(jnp.inf))
     frame = make_frame(
         color,
         variance=glass_frame.buffers.variance,
         samples=64,
-        biased={"photons": photons},
-    )
-    found = double_shrinkage.combine_frame(frame, "photons", window=9, stride=1)
-    assert all(np.isfinite(part).all() for part in found if part is not found.prior)
-    assert np.isfinite(np.delete(found.prior.reshape(-1, 3), (1310, 2569), 0)).all()
-    np.testing.assert_allclose(found.image[20, 30], photons.full[20, 30], rtol=1e-6)
-    np.testing.assert_allclose(found.image[40, 9], frame.color[40, 9], rtol=1e-6)
+        estimates={"photons": photons},
+    ).normalised()
+    photons, options = frame.estimates["photons"], {"window": 9, "stride": 1}
+    found = double_shrinkage.combine_frame(frame, photons, **options).image
+    inputs = double_shrinkage.make_inputs(frame, photons, **options)
+    shares = double_shrinkage.factors(*inputs[3:])
+    for part in (found, *inputs[3:], shares.biased, shares.prior):
+        assert np.isfinite(part).all()
+    prior = inputs.prior
+    assert np.isfinite(np.delete(prior.reshape(-1, 3), (1310, 2569), 0)).all()
+    np.testing.assert_allclose(found[20, 30], photons.image[20, 30], rtol=1e-6)
+    np.testing.assert_allclose(found[40, 9], frame.color[40, 9], rtol=1e-6)

@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 
 from jscomb import ensemble
 from jscomb.denoisers import smoothing
-from jscomb.frame import Biased
+from jscomb.frame import Estimate
 from jscomb.numerics import simplex
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from tests.statistics import assert_mean, assert_mean_below
@@ -249,21 +249,24 @@ def test_selection_drops_what_does_not_help(truth):
 
 def test_stacked_bases_name_the_one_that_does_not_fit(truth):
     halves = jnp.stack([truth, 2 * truth])
-    good, other = Biased(1.5 * truth, halves), Biased(truth[1:], halves[:, 1:])
-    full, a, b = ensemble.stack_bases({"one": good, "two": good})
+    good, other = Estimate(1.5 * truth, halves), Estimate(truth[1:], halves[:, 1:])
+    full, a, b = ensemble.stack_estimates({"one": good, "two": good})
     for stack, image in ((full, 1.5 * truth), (a, truth), (b, 2 * truth)):
         np.testing.assert_array_equal(stack, jnp.stack([image, image]))
     for bases, message in (
-        ({}, "at least one base, got none"),
-        ({"one": good, "two": Biased(truth)}, "base 'two' was not made from each half"),
-        ({"one": good, "two": other}, r"base 'two' has shape .* 'one' has"),
+        ({}, "at least one estimate, got none"),
         (
-            {"one": good, "two": Biased(truth, halves[:, 1:])},
-            "base 'two' has halves of",
+            {"one": good, "two": Estimate(truth)},
+            "needs estimates with halves: 'two' has none",
+        ),
+        ({"one": good, "two": other}, r"estimate 'two' has shape .* 'one' has"),
+        (
+            {"one": good, "two": Estimate(truth, halves[:, 1:])},
+            "estimate 'two' has halves of",
         ),
     ):
         with pytest.raises(ValueError, match=message):
-            ensemble.stack_bases(bases)
+            ensemble.stack_estimates(bases)
 
 
 def test_one_hot():

@@ -9,6 +9,7 @@ from experiments import (
     bias,
     bundle,
     correlation,
+    dependence,
     double_shrinkage,
     double_shrinkage_speed,
     ensemble,
@@ -21,10 +22,10 @@ from experiments import (
     speed_error,
     uncorrelated,
 )
+from experiments.rendering import UNTRAINED
 from jscomb import exr, metrics
-from jscomb.choice import UNTRAINED
 from jscomb.denoisers import oidn
-from jscomb.learning import methods, networks
+from jscomb.learning import networks, recipes
 
 BOX = """<scene version="3.0.0">
   <integrator type="path"/>
@@ -59,9 +60,9 @@ def test_errors_are_those_of_the_metrics(folder, glass_frame):
     ).items()
     assert key == ("glass", 64)
     assert errors.keys() == {"path tracing", "oidn", *UNTRAINED, "auto", "dual"}
-    frame = glass_frame.scaled(1 / glass_frame.exposure)
+    frame = glass_frame.normalised()
     r, noise = frame.reference
-    expected = metrics.rel_l2(frame.biased["oidn"].full, r, half_difference=noise)
+    expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
     np.testing.assert_allclose(errors["oidn"], expected, rtol=1e-5)
     assert errors["auto"] in (errors["oidn"], errors["whitened"])
     with pytest.raises(ValueError, match=r"no \.npz archive"):
@@ -82,10 +83,9 @@ def test_regression_is_measured(folder, tmp_path):
     assert found.keys() == {f"glass 64 {b}" for b in (*regression_error.BASES, "NFOR")}
     assert regression_error.run(config) == found  # kept, and not measured again
     row = found["glass 64 oidn"]
-    frame = frames.load(folder / "glass.npz", 64)
-    frame = frame.scaled(1 / frame.exposure)
+    frame = frames.load(folder / "glass.npz", 64).normalised()
     r, noise = frame.reference
-    expected = metrics.rel_l2(frame.biased["oidn"].full, r, half_difference=noise)
+    expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
     np.testing.assert_allclose(row["y"], expected, rtol=1e-6)
     assert row["features"] == 8
     image, seconds = speed_error.regressed(frame, speed_error.Setting(4, 11), 1)
@@ -158,8 +158,8 @@ def test_double_shrinkage_is_measured(tmp_path, vectorised):
     whole = exr.read_frame(tmp_path / "cornell-caustic-whole.exr")
     r, noise = whole.reference
     expected = metrics.rel_l2(
-        *(i / whole.exposure for i in (whole.color, r)),
-        half_difference=noise / whole.exposure,
+        *(i / whole.median_luminance for i in (whole.color, r)),
+        half_difference=noise / whole.median_luminance,
     )
     alone = row["error"]["path tracing alone"]
     np.testing.assert_allclose(alone, expected, rtol=1e-4)
@@ -216,9 +216,9 @@ def test_networks_are_measured_beside_the_rest(folder, glass_frame):
     rows = learned.run(learned.Config(folder, quick=True))
     errors = rows["glass", 64]
     assert {"path tracing", "oidn", "whitened", "njs", "dsc", "pd"} <= errors.keys()
-    image = methods.combine_frame(jax.random.key(0), glass_frame, "oidn", method="dsc")
-    r, noise = (i / glass_frame.exposure for i in glass_frame.reference)
-    image = image / glass_frame.exposure
+    frame, recipe = glass_frame.normalised(), recipes.RECIPES["dsc"]
+    inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
+    image, (r, noise) = recipe.combine(recipes.shipped("dsc"), inputs), frame.reference
     expected = metrics.rel_l2(image, r, half_difference=noise)
     np.testing.assert_allclose(errors["dsc"], expected, rtol=1e-3)
     table = learned.summary(rows)
@@ -237,3 +237,20 @@ def test_the_cost_of_networks_is_their_convolutions():
     full = 2 * (25 * 18 * 48 + 4 * 9 * 48 * 48 + 9 * 48 * 9)
     assert learned_speed.operations(network) == full
     assert costs["pd light"].operations < full / 3
+
+
+def test_shared_weights_are_measured_beside_own_ones(glass_frame, tmp_path):
+    """An ensemble is better than its first base, which the halves underestimate."""
+    if not oidn.available():
+        pytest.skip("needs Open Image Denoise")
+    path = tmp_path / "glass.exr"
+    exr.write_frame(path, glass_frame)
+    rows = dependence.run(dependence.Config((path, path), quick=True))
+    (row,) = rows.values()
+    for estimated, true in (row["shared"], row["own"]):
+        assert true < estimated < 0
+    assert row["shared"] != row["own"]
+    assert len(dependence.table(rows)) == 5
+    exr.write_frame(path, glass_frame.merged(2))
+    with pytest.raises(ValueError, match="needs a reference and four sub-buffers"):
+        dependence.run(dependence.Config((path,)))

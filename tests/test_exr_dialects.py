@@ -136,7 +136,7 @@ def test_tungsten_directory(tmp_path):
     np.testing.assert_allclose(frame.variance, noise(3, H, W, 3), rtol=1e-6)
     assert frame.depth[0, 0, 0] == 0
     np.testing.assert_array_equal(first.depth, frame.depth)
-    np.testing.assert_array_equal(second.biased["nlm"].full, b)
+    np.testing.assert_array_equal(second.estimates["nlm"].image, b)
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=r"empty: .*neither color\.exr nor colorA"):
         exr.read_frame(tmp_path / "empty")
@@ -167,7 +167,7 @@ def test_njs_file(tmp_path):
 def test_blender_layers(tmp_path):
     """Cycles with denoising data, of a denoised render with the compositor's output."""
     depth = 9 * noise(4, H, W, 1)
-    depth[0] = 1e10  # nothing there
+    depth[0] = 1e10  # background
     rgba = lambda seed: noise(seed, H, W, 4)
     channels = {
         **layer("Composite.Combined", rgba(0), "RGBA"),
@@ -180,11 +180,11 @@ def test_blender_layers(tmp_path):
         **layer("View Layer.Denoising Shadowing", noise(7, H, W, 1), "X"),
         **layer("Z second.Combined", rgba(8), "RGBA"),
     }
-    said = {"cycles.View Layer.samples": "128", "cycles.Z second.samples": "1"}
-    frame = exr.read_frame(write(tmp_path / "b.exr", channels, **said))
+    attributes = {"cycles.View Layer.samples": "128", "cycles.Z second.samples": "1"}
+    frame = exr.read_frame(write(tmp_path / "b.exr", channels, **attributes))
     assert frame.samples == 128
     np.testing.assert_array_equal(frame.color, rgba(2)[..., :3])
-    np.testing.assert_array_equal(frame.biased["denoised"].full, rgba(1)[..., :3])
+    np.testing.assert_array_equal(frame.estimates["denoised"].image, rgba(1)[..., :3])
     np.testing.assert_array_equal(frame.albedo, np.minimum(3 * noise(3, H, W, 3), 1))
     np.testing.assert_array_equal(frame.normal, noise(5, H, W, 3))
     np.testing.assert_array_equal(frame.depth[0], 0)
@@ -207,7 +207,7 @@ def test_blender_without_denoising(tmp_path):
     np.testing.assert_allclose(frame.variance, spread / 32, rtol=1e-6)
     np.testing.assert_array_equal(frame.albedo, noise(3, H, W, 3))
     np.testing.assert_array_equal(frame.normal, noise(2, H, W, 3))
-    assert not frame.biased
+    assert not frame.estimates
 
 
 def test_pd_files(tmp_path):
@@ -226,7 +226,7 @@ def test_pd_files(tmp_path):
     np.testing.assert_array_equal(frame.variance, variance)
     np.testing.assert_array_equal(frame.albedo, noise(2, H, W, 3))
     np.testing.assert_array_equal(frame.normal, noise(3, H, W, 3))
-    np.testing.assert_array_equal(frame.biased["denoised"].full, noise(4, H, W, 3))
+    np.testing.assert_array_equal(frame.estimates["denoised"].image, noise(4, H, W, 3))
     assert exr.read_frame(path, samples=8).samples == 8
 
 

@@ -1,4 +1,4 @@
-"""Safe division and invalid pixels."""
+"""Safe divisions and square roots, and invalid pixels."""
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,88 @@ def test_first_finite_chooses_whole_pixels():
     expected = [[[1, 2], [3, 4], [0, 0]]]
     np.testing.assert_array_equal(guards.first_finite(a, b), expected)
     np.testing.assert_array_equal(guards.finite(a, b)[0, :, 0], [True, False, False])
+
+
+def test_invalid_pixels_are_zeroed_in_all_images_and_stacks():
+    nan, inf = jnp.nan, jnp.inf
+    image = jnp.array([[[1.0, nan], [2.0, 3.0], [4.0, 5.0], [6.0, 7.0]]])
+    other = jnp.array([[[8.0], [9.0], [-inf], [10.0]]])
+    stack = jnp.stack([other + 20, other.at[0, 3].set(nan)])
+    valid, *zeroed = guards.zero_invalid(image, other, stack)
+    np.testing.assert_array_equal(valid[0, :, 0], [False, True, False, False])
+    for before, after in zip((image, other, stack), zeroed, strict=True):
+        assert before.shape == after.shape
+        np.testing.assert_array_equal(after[..., 1, :], before[..., 1, :])
+        assert not after[..., np.array([0, 2, 3]), :].any()
+    total = lambda *i: sum(jnp.sum(jnp.square(z)) for z in guards.zero_invalid(*i)[1:])
+    gradients = jax.grad(total, (0, 1, 2))(image, other, stack)
+    for after, gradient in zip(zeroed, gradients, strict=True):
+        np.testing.assert_array_equal(gradient, 2 * after)
+
+
+@pytest.mark.parametrize("transform", [lambda f: f, jax.jit])
+def test_a_weighted_ratio_where_weight_is_missing(transform):
+    total = jnp.array([[6.0, 3.0], [0.0, 0.0], [5.0, 7.0]])
+    weight = jnp.array([[2.0], [0.0], [jnp.nan]])
+    ratio = transform(lambda t, w: guards.weighted_ratio(t, w, otherwise=9.0))
+    np.testing.assert_array_equal(ratio(total, weight), [[3, 1.5], [9, 9], [9, 9]])
+    image = guards.weighted_ratio(total, weight, otherwise=-total)
+    np.testing.assert_array_equal(image, [[3, 1.5], [0, 0], [-5, -7]])
+    by_channel = jnp.array([[3.0, 1.0], [0.0, 1.0], [5.0, 0.0]])
+    expected = [[2, 3], [0, 0], [1, 0]]
+    np.testing.assert_array_equal(guards.weighted_ratio(total, by_channel), expected)
+    dt, dw = jax.grad(lambda t, w: jnp.sum(ratio(t, w)), (0, 1))(total, weight)
+    np.testing.assert_array_equal(dt, [[0.5, 0.5], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(dw, [[-(6 + 3) / 2**2], [0], [0]])
+
+
+@pytest.mark.parametrize("per_channel", [False, True])
+def test_a_masked_mean_is_that_of_the_selected_pixels(per_channel):
+    rng = np.random.default_rng(0)
+    values, mask = rng.normal(size=(4, 5, 3)), rng.random((4, 5, 1)) < 0.6
+    axes = 0 if per_channel else None
+    expected = values[mask[..., 0]].mean(axes)
+    values[~mask[..., 0]] = np.nan
+    mean = lambda v, m=None: guards.masked_mean(
+        v, m, per_channel=per_channel, otherwise=7.0
+    )
+    found = mean(jnp.asarray(values), jnp.asarray(mask))
+    assert found.shape == ((1, 1, 3) if per_channel else ())
+    np.testing.assert_allclose(found.ravel(), np.ravel(expected), rtol=1e-14)
+    gradient = jax.grad(lambda v: jnp.sum(mean(v, jnp.asarray(mask))))(values)
+    share = 1 / mask.sum() if per_channel else 1 / (3 * mask.sum())
+    np.testing.assert_allclose(gradient, np.where(mask, share, np.zeros(3)), rtol=1e-14)
+    whole = np.nan_to_num(values)
+    expected = whole.mean((0, 1) if per_channel else None)
+    np.testing.assert_allclose(mean(jnp.asarray(whole)).ravel(), np.ravel(expected))
+
+
+@pytest.mark.parametrize("per_channel", [False, True])
+def test_an_empty_mask_has_a_mean_and_no_derivative(per_channel):
+    values, empty = jnp.full((2, 3, 3), jnp.nan), jnp.zeros((2, 3, 1), bool)
+    mean = lambda v: guards.masked_mean(
+        v, empty, per_channel=per_channel, otherwise=7.0
+    )
+    assert mean(values).ravel().tolist() == [7.0] * (3 if per_channel else 1)
+    assert not jax.grad(lambda v: jnp.sum(mean(v)))(values).any()
+    assert guards.masked_mean(values, empty) == 0
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("transform", [lambda f: f, jax.jit])
+def test_a_safe_root_at_its_singular_point(dtype, transform):
+    square = jnp.array([4.0, 0.0, -0.0, -1.0, 1e-30, jnp.inf], dtype)
+    root = transform(guards.safe_sqrt)(square)
+    assert root.dtype == dtype
+    np.testing.assert_allclose(root, [2, 0, 0, 0, 1e-15, np.inf], rtol=1e-6)
+    gradient = transform(jax.vmap(jax.grad(guards.safe_sqrt)))(square)
+    np.testing.assert_allclose(gradient, [0.25, 0, 0, 0, 5e14, 0], rtol=1e-6)
+    tangent = jax.jvp(guards.safe_sqrt, (square,), (jnp.ones_like(square),))[1]
+    np.testing.assert_allclose(tangent, gradient, rtol=1e-6)
+
+
+def test_a_safe_root_reports_nan():
+    assert jnp.isnan(guards.safe_sqrt(jnp.array(jnp.nan)))
 
 
 def test_shapes_are_named():

@@ -23,12 +23,12 @@ ROOMS = [
     "metrics",
     "james_stein",
     "ensemble",
+    "double_shrinkage",
     "progressive",
     "uncorrelated",
-    "double_shrinkage",
     "denoisers",
     "learning",
-    "choice",
+    "methods",
     "exr",
     "plots",
     "cli",
@@ -47,22 +47,21 @@ MODULES = [
     importlib.import_module(m.name)
     for m in pkgutil.walk_packages(jscomb.__path__, "jscomb.")
 ]
-FUNCTIONS = [
-    pytest.param(f, id=f"{f.__module__}.{f.__name__}")
-    for module in MODULES
-    for name, f in inspect.getmembers(module, inspect.isfunction)
-    if f.__module__ == module.__name__
-    and not name.startswith("_")
-    and not module.__name__.startswith("jscomb.cli")  # the command's help
-]
+PAGES = api.modules()
 
-# What the API pages show, once each.
+# Every name in some `__all__`, once each.
 PUBLIC = {
     f"{each.__module__}.{each.__qualname__}": each
-    for module in api.modules().values()
-    for each in (getattr(module, name) for name in api.names(module))
-    if getattr(each, "__module__", "").startswith("jscomb")
+    for module in PAGES.values()
+    for each in (getattr(module, name) for name in getattr(module, "__all__", ()))
+    if getattr(each, "__module__", "").startswith("jscomb.")
+    and hasattr(each, "__qualname__")
 }
+FUNCTIONS = [
+    pytest.param(each, id=name)
+    for name, each in PUBLIC.items()
+    if inspect.isfunction(each)
+]
 
 
 def room(module: str) -> int:
@@ -94,6 +93,40 @@ def test_imports_flow_one_way(module):
     if name in COMBINERS:
         others = {n.split(".")[1] for n in ours if "." in n}
         assert not others & (COMBINERS - {name}), "no combiner imports another"
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_public_names_are_listed(name):
+    """All that a public module defines, or a package imports to export, sorted."""
+    module = PAGES[name]
+    if name == "jscomb.typing":
+        return
+    listed = module.__all__
+    assert listed == sorted(listed, key=lambda n: (not n.isupper(), n))
+    assert not [n for n in listed if n.startswith("_")]
+    defined = {
+        n
+        for n, each in vars(module).items()
+        if inspect.isfunction(each) and each.__module__ == name and n[0] != "_"
+    }
+    assert defined <= set(listed)
+
+
+@pytest.mark.parametrize("paper", sorted(COMBINERS))
+def test_papers_share_one_floor_plan(paper):
+    """The estimator, what it needs to know, and the paper on a frame."""
+    files = {path.stem for path in (ROOT / "jscomb" / paper).glob("*.py")}
+    assert {"__init__", "_combine", "_estimate", "_frame"} <= files
+    package = importlib.import_module(f"jscomb.{paper}")
+    assert ("_neural" in files) == hasattr(package, "neural_combine")
+    assert {"combine", "combine_frame", "NEEDS"} <= set(package.__all__)
+    annotations = inspect.get_annotations(package.combine_frame, eval_str=True)
+    assert annotations["return"] is jscomb.Estimate
+    for name in ("combine_frame", "neural_combine_frame"):
+        if function := getattr(package, name, None):
+            order = [p for p in inspect.signature(function).parameters]
+            ranks = [n for n in ("key", "denoise", "network", "frame") if n in order]
+            assert order[: len(ranks)] == ranks or paper == "uncorrelated"
 
 
 def test_only_the_networks_need_flax():

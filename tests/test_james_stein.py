@@ -127,7 +127,7 @@ def test_gradients_with_a_divergence(whiten):
 def test_matches_the_definition_on_a_real_frame(real_frame, whiten):
     """In float32, where radiance and variance span eight decades."""
     frame = real_frame
-    data = frame.color, frame.biased["oidn"].full, frame.variance
+    data = frame.color, frame.estimates["oidn"].image, frame.variance
     assert data[0].dtype == jnp.float32
     result = james_stein.combine(*data, whiten=whiten)
     np.testing.assert_allclose(result, oracle(*data, 15, whiten), rtol=2e-5, atol=1e-7)

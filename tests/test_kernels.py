@@ -25,9 +25,9 @@ def test_predicted_is_given_a_strip_at_a_time(shape, reach):
     mask = jnp.asarray(RNG.random((*shape, 1)) < 0.8)
     found = predicted_mean(images, identity(weights, reach), 5, mask=mask)
     halves = jnp.split(weights, 2, axis=-1)
-    for k, share in enumerate(halves):
-        wanted = kernel_mean(images[k], share, 5, mask=mask)
-        np.testing.assert_allclose(found[k], wanted, rtol=1e-12)
+    for k, half in enumerate(halves):
+        expected = kernel_mean(images[k], half, 5, mask=mask)
+        np.testing.assert_allclose(found[k], expected, rtol=1e-12)
 
 
 def test_predicted_differentiates_in_both_modes():
@@ -36,7 +36,7 @@ def test_predicted_differentiates_in_both_modes():
     check_grads(jax.jit(mean), (images, jnp.asarray(weights)), order=1)
 
 
-def test_masked_pixels_are_never_looked_at():
+def test_masked_pixels_are_excluded():
     images = jnp.asarray(RNG.random((1, 20, 4, 2))).at[0, 3, 1].set(jnp.nan)
     weights, mask = (
         jnp.asarray(RNG.random((20, 4, 9))),
@@ -72,14 +72,14 @@ def test_memory_does_not_hold_all_weights():
 def test_strips_of_rows_are_the_image(height):
     image, other = (jnp.asarray(RNG.random((height, 3, c))) for c in (2, 1))
 
-    def shifted(near, own):
+    def shifted(near, strip):
         """The pixel two rows above and the one three rows below."""
-        rows = own.shape[0]
-        return near[1 : 1 + rows] + near[6 : 6 + rows] * own
+        rows = strip.shape[0]
+        return near[1 : 1 + rows] + near[6 : 6 + rows] * strip
 
     found = jax.jit(lambda a, b: map_rows(shifted, [(a, 3), (b, 0)], rows=16))(
         image, other
     )
     padded = np.pad(image, ((3, 3), (0, 0), (0, 0)))
-    wanted = padded[1 : 1 + height] + padded[6 : 6 + height] * np.asarray(other)
-    np.testing.assert_allclose(found, wanted, rtol=1e-14)
+    expected = padded[1 : 1 + height] + padded[6 : 6 + height] * np.asarray(other)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)

@@ -1,4 +1,4 @@
-"""Training, its files, and the methods that use trained networks."""
+"""Training, checkpoints, and the recipes of the networks."""
 
 import dataclasses
 import json
@@ -13,16 +13,16 @@ import pytest
 import jscomb
 from experiments import ship, train
 from jscomb import exr
-from jscomb.denoisers import oidn
-from jscomb.learning import files, losses, methods, networks, training
-from jscomb.learning.methods import METHODS
+from jscomb.denoisers import kernel_predicting, oidn
+from jscomb.learning import checkpoints, losses, networks, recipes, training
+from jscomb.learning.recipes import RECIPES
 from jscomb.metrics import rel_l2
 from tests.statistics import assert_mean
 
 DATA = pathlib.Path(__file__).parent / "data"
 RNG = np.random.default_rng(5)
 SCHEDULE = training.Schedule(steps=6, batch=2, crop=8)
-ROOT = pathlib.Path(methods.__file__).parent
+SHIPPED = ["njs", "dsc", "pd"]
 
 
 @pytest.fixture
@@ -34,17 +34,17 @@ def examples():
 
 
 def test_draw_keeps_images_together(examples):
-    """Inputs and reference are cut, turned and coloured alike; the exposure differs."""
+    """Inputs and reference are cut, flipped and coloured alike; the unit differs."""
     variants = set()
     for key in jax.random.split(jax.random.key(0), 20):
-        inputs, reference, exposure = training.draw(key, examples, SCHEDULE)
+        inputs, reference, unit = training.draw(key, examples, SCHEDULE)
         assert reference.shape == (8, 8, 3)
         share = float(inputs["full"][0, 0, 0] / reference[0, 0, 0])
         np.testing.assert_allclose(inputs["full"], share * reference, rtol=1e-6)
         assert inputs["one"].shape == (8, 8, 1)
-        assert 0.5 <= float(exposure) <= 2
+        assert 0.5 <= float(unit) <= 2
         variants.add(share)
-        # Its pixels are those of one of the frames, whatever was done to them.
+        # Its pixels are those of one of the frames, up to the order of channels.
         pixels = np.sort(np.asarray(examples.reference).reshape(-1, 3), axis=-1)
         found = np.sort(np.asarray(reference).reshape(-1, 3), axis=-1)
         assert {tuple(p) for p in found} <= {tuple(p) for p in pixels}
@@ -52,7 +52,7 @@ def test_draw_keeps_images_together(examples):
 
 
 def test_every_pixel_is_drawn_equally_often(examples):
-    """In the mean over draws a crop has the mean of what crops may contain."""
+    """The mean over draws is the mean over all possible crops."""
     keys = jax.random.split(jax.random.key(1), 4000)
     whole = dataclasses.replace(SCHEDULE, crop=12)
     drawn = jax.vmap(lambda key: training.draw(key, examples, whole)[1].mean())(keys)
@@ -61,9 +61,9 @@ def test_every_pixel_is_drawn_equally_often(examples):
 
 
 def fit(examples, steps):
-    """Learn what to multiply the variants with; the states after each step."""
+    """Return an objective, its network, and a run that learns a factor."""
 
-    def objective(network, inputs, reference, exposure):
+    def objective(network, inputs, reference, unit):
         return jnp.mean(jnp.square(network["scale"] * inputs["full"] - reference))
 
     network = {"scale": jnp.ones((), jnp.float32)}
@@ -71,12 +71,12 @@ def fit(examples, steps):
     return objective, network, training.run(objective, state, examples, SCHEDULE)
 
 
-def test_a_run_goes_on_as_if_it_had_not_stopped(examples, tmp_path):
+def test_a_resumed_run_equals_one_without_interruption(examples, tmp_path):
     objective, network, run = fit(examples, 6)
     states = [state for state, _ in run]
     assert [int(s.step) for s in states] == [1, 2, 3, 4, 5, 6]
-    path = files.save(tmp_path / "state.safetensors", states[2])
-    middle = files.load(path, training.start(network, SCHEDULE))
+    path = checkpoints.save(tmp_path / "state.safetensors", states[2])
+    middle = checkpoints.load(path, training.start(network, SCHEDULE))
     *_, (last, _) = training.run(objective, middle, examples, SCHEDULE)
     for a, b in zip(jax.tree.leaves(last), jax.tree.leaves(states[-1]), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -92,8 +92,8 @@ def test_crops_must_fit(examples):
 
 
 def test_evaluate_takes_the_first_variant(examples):
-    objective = lambda network, inputs, reference, exposure: jnp.mean(
-        jnp.square(network * inputs["full"] - reference) * exposure
+    objective = lambda network, inputs, reference, unit: jnp.mean(
+        jnp.square(network * inputs["full"] - reference) * unit
     )
     found = training.evaluate(objective, jnp.float32(2), examples)
     wanted = np.square(np.asarray(examples.reference)).mean((1, 2, 3))
@@ -111,8 +111,8 @@ def test_log_l2_matches_its_equation():
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
-def test_a_noisy_reference_does_not_bend_a_squared_loss():
-    """The gradient's mean over references is that of the true one."""
+def test_a_noisy_reference_does_not_bias_a_squared_loss():
+    """The gradient's mean over noisy references is that of the true one."""
     image, truth = jnp.asarray(RNG.random((2, 6, 6, 3)))
     loss = lambda scale, r: jnp.mean(jnp.square(scale * image - r))
     noise = jax.random.exponential(jax.random.key(0), (4000, 6, 6, 3)) - 1
@@ -124,13 +124,13 @@ def test_a_noisy_reference_does_not_bend_a_squared_loss():
 def saved(tmp_path_factory):
     """A light mixing network as its file and card."""
     path = tmp_path_factory.mktemp("network") / "pd.safetensors"
-    files.save(path, networks.MixingNetwork(jax.random.key(0), size="light"))
+    checkpoints.save(path, networks.MixingNetwork(jax.random.key(0), size="light"))
     path.with_suffix(".json").write_text('{"size": "light"}')
     return path
 
 
 def test_a_network_comes_back(saved):
-    network = methods.load(METHODS["pd"], saved)
+    network = recipes.load_network(RECIPES["pd"], saved)
     drawn = networks.MixingNetwork(jax.random.key(0), size="light")
     for a, b in zip(jax.tree.leaves(network), jax.tree.leaves(drawn), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -149,7 +149,7 @@ def test_a_network_comes_back(saved):
         ("other", r"does not fit the network: .* is float32\[24\], expected nothing"),
     ],
 )
-def test_what_does_not_fit_says_so(saved, tmp_path, harm, message):
+def test_files_that_do_not_fit_are_rejected(saved, tmp_path, harm, message):
     path = pathlib.Path(shutil.copy(saved, tmp_path))
     card = pathlib.Path(shutil.copy(saved.with_suffix(".json"), tmp_path))
     if harm == "remove":
@@ -163,42 +163,72 @@ def test_what_does_not_fit_says_so(saved, tmp_path, harm, message):
     elif harm == "size":
         card.write_text('{"size": "full"}')
     with pytest.raises(ValueError, match=message) as error:
-        methods.load(METHODS["njs" if harm == "other" else "pd"], path)
+        recipes.load_network(RECIPES["njs" if harm == "other" else "pd"], path)
     assert str(tmp_path) in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_unknown_names(glass_frame):
-    with pytest.raises(ValueError, match="no method 'gan'; there are njs, dsc, pd"):
-        methods.shipped("gan")
-    key = jax.random.key(0)
-    with pytest.raises(ValueError, match="no method 'gan'"):
-        methods.combine_frame(key, glass_frame, "oidn", method="gan")
-    photons = glass_frame.with_biased("photons", glass_frame.color)
-    with pytest.raises(ValueError, match="pd needs a denoiser's derivative"):
-        methods.combine_frame(key, photons, "photons", method="pd")
-    with pytest.raises(ValueError, match=r"no biased image 'sppm'; there are \['oidn"):
-        methods.combine_frame(jax.random.key(0), glass_frame, "sppm", method="njs")
+def test_unknown_network():
+    with pytest.raises(ValueError, match="network 'gan'; there are njs, dsc, pd"):
+        recipes.shipped("gan")
+    with pytest.raises(ValueError, match="network 'kernels'; there are njs, dsc, pd"):
+        recipes.shipped("kernels")
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_shipped_networks_help(method, glass_frame):
-    """On a scene that no network has seen; beside both inputs."""
-    if method == "pd" and not oidn.available():
+def test_a_kernel_predictor_needs_features(glass_frame):
+    with pytest.raises(ValueError, match="needs a normalised frame"):
+        kernel_predicting.neural_inputs(glass_frame)
+    bare = glass_frame.normalised()
+    bare = bare._replace(buffers=bare.buffers._replace(depth=None))
+    with pytest.raises(ValueError, match="a kernel predictor needs depth"):
+        kernel_predicting.neural_inputs(bare)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_networks_help(name, glass_frame):
+    """On a scene unseen in training; compared with both inputs."""
+    if name == "pd" and not oidn.available():
         pytest.skip("needs Open Image Denoise")
-    image = methods.combine_frame(jax.random.key(0), glass_frame, "oidn", method=method)
-    (r, noise), unit = glass_frame.reference, glass_frame.exposure
+    recipe, frame = RECIPES[name], glass_frame.normalised()
+    estimate = frame.estimates["oidn"]
+    inputs = recipe.inputs(jax.random.key(0), frame, estimate)
+    image = jax.jit(recipe.combine)(recipes.shipped(name), inputs)
+    r, noise = frame.reference
     noisy, denoised, found = (
-        rel_l2(i / unit, r / unit, half_difference=noise / unit)
-        for i in (glass_frame.color, glass_frame.biased["oidn"].full, image)
+        rel_l2(i, r, half_difference=noise)
+        for i in (frame.color, estimate.image, image)
     )
     assert found < noisy / 2
     assert found < 1.1 * denoised
 
 
+# Inputs by name: their channels, and the power of the unit that they are measured in.
+INPUTS = {
+    "njs": {"unbiased": (3, 1), "biased_a": (3, 1), "biased_b": (3, 1)}
+    | {"variance": (3, 2)},
+    "dsc": {"prior": (3, 1), "unbiased": (3, 1), "biased": (3, 1)}
+    | {"variance": (1, 2), "mse": (1, 2)},
+    "pd": {"unbiased": (3, 1), "biased": (3, 1), "variance": (3, 2), "sure": (3, 2)},
+    "kernels": {"noisy": (3, 1), "variance": (3, 2)}
+    | {"albedo": (3, 0), "normal": (3, 0), "depth": (1, 0)},
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_a_unit_undoes_the_brightness_of_a_scene(name):
+    recipe, unit = RECIPES[name], jnp.asarray(3.0)
+    network = recipe.network(jax.random.key(0), size="light")
+    inputs, bright = {}, {}
+    for key, (channels, power) in INPUTS[name].items():
+        inputs[key] = jnp.asarray(RNG.random((9, 10, channels)))
+        bright[key] = 3.0**power * inputs[key]
+    found = recipe.combine(network, recipes.in_unit(bright, unit))
+    np.testing.assert_allclose(found, recipe.combine(network, inputs), rtol=1e-9)
+
+
 def test_shipped_files_are_small_and_described():
-    weights = list((ROOT / "weights").glob("*.safetensors"))
-    assert {w.stem for w in weights} == set(METHODS)
+    weights = list(recipes.WEIGHTS.glob("*.safetensors"))
+    assert {w.stem for w in weights} == set(SHIPPED)
     assert sum(w.stat().st_size for w in weights) < 10e6
     for file in weights:
         card = json.loads(file.with_suffix(".json").read_text())
@@ -210,7 +240,7 @@ def test_shipped_files_are_small_and_described():
 
 @pytest.fixture(scope="module")
 def crops(tmp_path_factory):
-    """Four pieces of each bundled frame; the first piece is held out."""
+    """Return a folder of four pieces of each bundled frame; the first is held out."""
     folder = tmp_path_factory.mktemp("crops")
     for file in (pathlib.Path(jscomb.__file__).parent / "data").glob("*.exr"):
         frame, spp = exr.read_frame(file), file.stem.rpartition("-")[2]
@@ -224,10 +254,10 @@ def crops(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["pd", "kernels-njs"])
 def test_quick_training_lowers_the_validation_loss(method, crops, tmp_path):
-    """On a piece that is not trained on; and a finished run is left as it is.
+    """On a held-out piece; and a finished run stays unchanged.
 
-    Of the two that begin far from their best: njs and dsc begin as the estimators
-    without a network, which a minute does not better for certain.
+    For the two that start far from their optimum: njs and dsc start as the estimators
+    without a network, which a minute of training does not certainly improve.
     """
     if method == "pd" and not oidn.available():
         pytest.skip("needs Open Image Denoise")

@@ -14,11 +14,11 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-@settings(deadline=None)  # the first example waits for the compiler
+@settings(deadline=None)  # the first example compiles
 @given(data=st.data())
 def test_the_median_is_that_of_the_valid_values(kind, data):
     width = 8 * np.dtype(kind).itemsize
-    # XLA takes numbers below the normal ones for 0.
+    # XLA flushes subnormal numbers to 0.
     floats = st.floats(0, 2.0**100, width=width, allow_subnormal=False)
     values = data.draw(arrays.arrays(kind, (3, 4, 1), elements=floats))
     valid = data.draw(arrays.arrays(bool, values.shape))

@@ -1,4 +1,4 @@
-"""Networks: convolutions, sizes, and the combiners that they serve."""
+"""Networks: convolutions, sizes, reach, and the combiners that use them."""
 
 import jax
 import jax.numpy as jnp
@@ -11,23 +11,24 @@ from jscomb import double_shrinkage, james_stein, progressive
 from jscomb.denoisers import kernel_predicting
 from jscomb.learning import networks
 from jscomb.numerics.kernels import Kernels
+from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.sure import monte_carlo_sure
 
 RNG = np.random.default_rng(3)
 
 
 def key():
-    """The same key, as if for the first time."""
+    """Return the same key, as if unused."""
     return jax.random.key(1)
 
 
 def parameters_of(network) -> int:
-    """How many numbers a network has."""
+    """Count the numbers of a network."""
     return sum(p.size for p in jax.tree.leaves(network))
 
 
 def random_convolution(size=3, inputs=2, outputs=3):
-    """One with a bias, in float64."""
+    """Return a convolution with a bias, in float64."""
     convolution = networks.Convolution(key(), inputs, outputs, size=size)
     draw = lambda leaf: jnp.asarray(RNG.normal(size=leaf.shape))
     return jax.tree.map(draw, convolution)
@@ -53,7 +54,7 @@ def test_convolution_matches_loops(size, shape):
 
 @pytest.mark.parametrize("size", [1, 3, 5])
 def test_convolution_derivatives(size):
-    """Ours in the kernel against XLA's, under vmap as in training; both modes."""
+    """Our derivative in the kernel equals XLA's, under vmap and in both modes."""
     convolution = random_convolution(size)
     images = jnp.asarray(RNG.normal(size=(4, 19, 6, 2)))
 
@@ -80,7 +81,7 @@ def test_convolution_derivatives(size):
 
 @pytest.mark.parametrize("shape", [(1, 1), (4, 8), (5, 7), (9, 1)])
 def test_unet_of_any_size(shape):
-    """Sizes that the levels do not divide are those of an image with zeros around."""
+    """An image that is not whole blocks is padded with zeros."""
     net = networks.UNet(key(), 2, size="light")
     image = jnp.asarray(RNG.random((*shape, 2)))
     out = net(image)
@@ -89,6 +90,77 @@ def test_unet_of_any_size(shape):
     need = [-(-n // 4) * 4 for n in shape]
     padded = net(block[: need[0], : need[1]])
     np.testing.assert_allclose(out, padded[: shape[0], : shape[1]], rtol=1e-12)
+
+
+def transparent(network):
+    """The network in float64 with positive weights, so that no ReLU blocks a signal."""
+    draw = lambda p: jnp.asarray(
+        RNG.uniform(0.5, 1.5, p.shape) / max(p[..., 0].size, 1)
+    )
+    weights = lambda p: draw(p) if p.ndim == 4 else jnp.zeros(p.shape)
+    return jax.tree.map(weights, network)
+
+
+def outputs(kernels):
+    """Weights of every pixel's window."""
+    pad = [(kernels.reach, kernels.reach), (0, 0), (0, 0)]
+    return kernels.head(jnp.pad(kernels.features, pad))
+
+
+def njs_outputs(network, image):
+    """Weights and alpha."""
+    kernels, share = network(image, image, image, image)
+    return jnp.concatenate([outputs(kernels), share], axis=-1)
+
+
+def dsc_outputs(network, image):
+    """Weights and confidence."""
+    kernels, confidence = network(*3 * [image], *2 * [image[..., :1]])
+    return jnp.concatenate([outputs(kernels), confidence], axis=-1)
+
+
+REACHES = {
+    "body": (lambda: networks.UNet(key(), 3, size="light"), lambda n, i: n(i)),
+    "njs": (
+        lambda: networks.JamesSteinNetwork(key(), window=3, size="light"),
+        njs_outputs,
+    ),
+    "dsc": (
+        lambda: networks.ShrinkageNetwork(key(), window=3, size="light"),
+        dsc_outputs,
+    ),
+    "pd": (
+        lambda: networks.MixingNetwork(key(), size="light"),
+        lambda n, i: n(i, 0 * i, i, i).reshape(*i.shape[:2], 9),
+    ),
+    "kernels": (
+        lambda: networks.KernelPredictor(key(), features=3, window=3, size="light"),
+        lambda n, i: outputs(n(i, i, i)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REACHES)
+def test_reach_is_exact(name):
+    """A pixel changes outputs as far as the reach, and none beyond.
+
+    Wherever it is in a block; it is the only one that is not black, so that it is the
+    maximum wherever it is pooled.
+    """
+    make, of = REACHES[name]
+    network = transparent(make())
+    multiple, reach = network.multiple, network.reach
+    start = multiple * (reach // multiple + 1)
+    black = jnp.zeros((2 * start + multiple, 2 * start + multiple, 3))
+    apply = jax.jit(of)
+    before, farthest = apply(network, black), []
+    for row in range(start, start + multiple):
+        column = 2 * start + multiple - 1 - row
+        after = apply(network, black.at[row, column].set(1e3))
+        changed = np.argwhere(np.any(np.asarray(after != before), axis=-1))
+        distances = np.abs(changed - [row, column]).max(axis=0)
+        farthest.append(distances)
+    np.testing.assert_array_equal(np.max(farthest, axis=0), [reach, reach])
 
 
 def test_sizes_are_the_papers():
@@ -106,7 +178,7 @@ def test_sizes_are_the_papers():
 
 
 def stub_kernels(weights):
-    """The same weights at every pixel."""
+    """Return a network with the same weights at every pixel."""
     shape = lambda f: (*f.shape[:2], len(weights))
     head = lambda f: jnp.broadcast_to(jnp.asarray(weights, f.dtype), shape(f))
     return lambda image: Kernels(image, head, 0)
@@ -114,9 +186,9 @@ def stub_kernels(weights):
 
 @pytest.fixture
 def images(glass_frame):
-    """x, y, y_a, y_b and variance, float64."""
-    y = glass_frame.biased["oidn"]
-    given = glass_frame.color, y.full, *y.halves, glass_frame.variance
+    """Return x, y, y_a, y_b and variance, float64."""
+    y = glass_frame.estimates["oidn"]
+    given = glass_frame.color, y.image, *y.halves, glass_frame.variance
     return [i.astype(jnp.float64) for i in given]
 
 
@@ -143,12 +215,10 @@ def test_unit_kernels_are_double_shrinkage_of_single_pixels(images):
     def network(p, u, b, v, m):
         return double_shrinkage.Filters(both(u), eta)
 
-    unit = jnp.asarray(2.0)
-    found = double_shrinkage.neural_combine(
-        network, p, x, y, one, one / 3, exposure=unit
-    )
-    # The network's confidence is in units of the squared exposure.
-    wanted = double_shrinkage.combine(p, x, y, one, one / 3, 4 * eta)
+    found = double_shrinkage.neural_combine(network, p, x, y, one, one / 3)
+    # The network's confidence is that of normalised images.
+    square = jnp.square(median_luminance(x))
+    wanted = double_shrinkage.combine(p, x, y, one, one / 3, square * eta)
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
@@ -196,7 +266,7 @@ NETWORKS = {
 
 @pytest.fixture(scope="module", params=NETWORKS)
 def neural(request):
-    """A light network and its combiner, with value and gradient compiled once."""
+    """Return a light network and its combiner, compiled once, with its gradient."""
     kind, combine = NETWORKS[request.param]
     network = kind(key(), size="light")
     both = lambda n, *images: jnp.sum(combine(n, *images))
@@ -205,7 +275,7 @@ def neural(request):
 
 
 def hard_cases():
-    """x, y and variance that have been the end of other programs."""
+    """Return x, y and variance that break careless programs."""
     x, y, v = RNG.random((3, 12, 13, 3)).astype(np.float32)
     firefly = x.copy()
     firefly[4, 5] = 1e6
@@ -252,7 +322,7 @@ def test_scale_equivariant(neural, scale, glass_frame):
         i[20:44, 20:44].astype(jnp.float64)
         for i in (
             glass_frame.color,
-            glass_frame.biased["oidn"].full,
+            glass_frame.estimates["oidn"].image,
             glass_frame.variance,
         )
     )
@@ -262,7 +332,11 @@ def test_scale_equivariant(neural, scale, glass_frame):
 
 def test_gradients_reach_every_parameter(neural, glass_frame):
     network, _, gradient = neural
-    images = glass_frame.color, glass_frame.biased["oidn"].full, glass_frame.variance
+    images = (
+        glass_frame.color,
+        glass_frame.estimates["oidn"].image,
+        glass_frame.variance,
+    )
     _, (of_network, *_) = gradient(network, *images)
     for leaf in jax.tree.leaves(of_network):
         assert np.any(np.asarray(leaf) != 0)
@@ -278,10 +352,7 @@ def test_sure_of_a_network(glass_frame):
             [glass_frame.albedo, glass_frame.normal, glass_frame.depth], axis=-1
         )
     )
-    unit = jnp.asarray(1.0)
-    denoise = lambda x: kernel_predicting.denoise(
-        network, x, v, features, exposure=unit
-    )
+    denoise = lambda x: kernel_predicting.denoise_normalised(network, x, v, features)
     found = monte_carlo_sure(key(), denoise, x, v)
     deviation = jnp.sqrt(v) * jax.random.rademacher(
         jax.random.split(key())[0], x.shape, x.dtype

@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import exr
-from jscomb.denoisers import nfor, nonlocal_means, rdfc
+from jscomb.denoisers import bilateral, nfor, nonlocal_means, rdfc, smoothing
 from jscomb.frame import make_frame
 from jscomb.metrics import rel_l2
 from tests.conftest import DATA
@@ -111,8 +111,8 @@ def test_rdfc_of_a_frame():
     )
     plain, denoised = (rdfc.denoise_frame(f, window=11) for f in (bare, frame))
     x, v = frame.color, frame.variance
-    np.testing.assert_array_equal(plain.full, means(x, x, v, window=11))
-    assert error(denoised.full) < 0.3 * error(x)
+    np.testing.assert_array_equal(plain.image, means(x, x, v, window=11))
+    assert error(denoised.image) < 0.3 * error(x)
     for half, base in zip(frame.halves(), denoised.halves, strict=True):
         assert error(base) < 0.3 * error(half.color)
 
@@ -154,11 +154,11 @@ def test_nfor_lowers_the_error_of_a_real_frame():
     reference, noise = box_frame.reference
     error = lambda image: rel_l2(image, reference, half_difference=noise)
     denoised = nfor.denoise_frame(box_frame)
-    assert error(denoised.full) < 0.3 * error(box_frame.color)
+    assert error(denoised.image) < 0.3 * error(box_frame.color)
     assert error(denoised.halves[0]) < 0.3 * error(box_frame.halves()[0].color)
     for scale in (1e-6, 1e6):
-        other = nfor.denoise_frame(box_frame.scaled(scale)).full / scale
-        np.testing.assert_allclose(other, denoised.full, rtol=1e-3, atol=1e-5)
+        other = nfor.denoise_frame(box_frame.scaled(scale)).image / scale
+        np.testing.assert_allclose(other, denoised.image, rtol=1e-3, atol=1e-5)
 
 
 def test_nfor_is_consistent():
@@ -201,7 +201,96 @@ def test_nfor_of_a_bare_frame():
     given = make_frame(color[:4], variance=np.full((4, 9, 10, 3), 0.01))
     assert run(given).halves is not None
     good_half = color[4:, 4, 4].mean(axis=0)
-    np.testing.assert_allclose(eight.full[4, 4], good_half, rtol=1e-6)
+    np.testing.assert_allclose(eight.image[4, 4], good_half, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("buffers", "given", "halves"),
+    [
+        (2, True, False),
+        (4, False, False),
+        (4, True, True),
+        (8, False, True),
+        (8, True, True),
+    ],
+)
+def test_nfor_has_halves_where_each_is_a_frame_for_it(buffers, given, halves):
+    color = RNG.uniform(0.5, 1, (buffers, 5, 6, 3))
+    variance = jnp.full(color.shape, 0.01) if given else None
+    frame = make_frame(color, variance=variance)
+    made = nfor.denoise_frame(frame, window=3)
+    assert (made.halves is not None) == halves
+    if halves:
+        for half, image in zip(frame.halves(), made.halves, strict=True):
+            alone = nfor.denoise_frame(half, window=3).image
+            np.testing.assert_allclose(image, alone, rtol=1e-12)
+
+
+def depends(function, images, k, reach):
+    """Whether pixels that far see a change of the middle pixel of image k, or beyond.
+
+    Args:
+        function: of the images to one of their size.
+        images: square, of odd width.
+        k: which of them is changed.
+        reach: distance in pixels.
+
+    Returns:
+        at that distance, and anywhere beyond it.
+    """
+    middle = len(images[k]) // 2
+    changed = list(images)
+    changed[k] = images[k].at[middle, middle].multiply(0.9)
+    run = jax.jit(function)
+    moved = np.any(np.asarray(run(*changed) != run(*images)), axis=-1)
+    away = abs(np.arange(len(moved)) - middle)
+    distance = np.maximum.outer(away, away)
+    assert distance.max() > reach
+    return moved[distance == reach].any(), moved[distance > reach].any()
+
+
+LOCAL = {
+    "bilateral": (
+        lambda x, v, f: bilateral.denoise(x, v, f, window=7, sigma_radiance=9.0),
+        bilateral.reach(window=7),
+        # The image and its variance through the pooled guide, features directly.
+        (4, 4, 3),
+    ),
+    "nonlocal_means": (
+        lambda x, v, f: nonlocal_means.denoise(x, x, v, window=7, patch=5),
+        nonlocal_means.reach(window=7, patch=5),
+        (5, 5, None),
+    ),
+    "rdfc": (
+        lambda x, v, f: rdfc.denoise(x, x, v, f, window=7, patch=5),
+        rdfc.reach(window=7, patch=5),
+        (5, 5, 3),
+    ),
+    "rdfc, patches of a pixel": (
+        lambda x, v, f: rdfc.denoise(x, x, v, f, window=3, patch=1),
+        rdfc.reach(window=3, patch=1),
+        (1, 1, 1),
+    ),
+    "gaussian": (
+        lambda x, v, f: smoothing.gaussian(x, sigma=1.3),
+        smoothing.reach(sigma=1.3),
+        (4, None, None),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_reach_is_exact(name):
+    """One pixel's change is seen at that distance, and nowhere beyond."""
+    denoise, reach, reaches = LOCAL[name]
+    near = jnp.asarray(RNG.uniform(1, 1.1, (2, 17, 17, 2)))
+    images = near[0], 5e-4 * near[1], 0.6 * near[1]
+    assert reach == max(r for r in reaches if r is not None)
+    for k, own in enumerate(reaches):
+        if own is None:
+            assert not any(depends(denoise, images, k, 0))
+        else:
+            assert depends(denoise, images, k, own) == (True, False)
 
 
 def test_nfor_survives_bad_pixels():
@@ -219,7 +308,8 @@ def test_nfor_survives_bad_pixels():
 
 @pytest.mark.usefixtures("unchecked")
 def test_frame_without_what_it_needs():
-    with pytest.raises(ValueError, match="no sub-buffers"):
+    lacking = "nfor needs half buffers: render with variances, or at least 4"
+    with pytest.raises(ValueError, match=lacking):
         nfor.denoise_frame(make_frame(jnp.ones((4, 4, 3))))
     with pytest.raises(ValueError, match="strength must be positive, got 0"):
         nonlocal_means.weights(jnp.ones((4, 4, 3)), jnp.ones((4, 4, 3)), strength=0.0)

@@ -105,11 +105,13 @@ def test_weighted_by_squared_radius(config):
 def test_a_frame_with_photons(config):
     frame = photon_mapping.run(config)
     read = exr.read_frame(config.out)
-    photons = read.biased[photon_mapping.PHOTONS]
-    np.testing.assert_allclose(photons.full, np.mean(photons.halves, axis=0), rtol=1e-5)
+    photons = read.estimates[photon_mapping.PHOTONS]
+    np.testing.assert_allclose(
+        photons.image, np.mean(photons.halves, axis=0), rtol=1e-5
+    )
     assert photons.halves.shape == (2, SIZE, SIZE, 3)
     assert not np.array_equal(*photons.halves)
-    np.testing.assert_array_equal(photons.full, frame.biased["photons"].full)
+    np.testing.assert_array_equal(photons.image, frame.estimates["photons"].image)
     assert read.samples == 4
     told = exr.read_provenance(config.out)
     assert (told["photons"], told["passes"], told["radius"]) == (20_000, 4, 0.05)

@@ -95,9 +95,12 @@ def test_gradients_and_vmap():
     np.testing.assert_allclose(both[1], solve(*missing), rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("scale", [1e-8, 1e6])
-def test_scale_equivariant(scale):
-    given = tuple(g.astype(jnp.float32) for g in problem((16, 12)))
+@pytest.mark.parametrize("scale", [1e-25, 1e-8, 1e6, 1e25])
+@pytest.mark.parametrize("value", [0.5, np.nan])
+def test_scale_equivariant(scale, value):
+    """Also where squares leave the range of float32."""
+    y, g, h = (g.astype(jnp.float32) for g in problem((16, 12)))
+    given = y.at[3, 4].set(value), g, h.at[5, 6, 0].set(value)
     s = jnp.float32(scale)
     np.testing.assert_allclose(
         solve(*(s * g for g in given)),
@@ -108,7 +111,7 @@ def test_scale_equivariant(scale):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_missing_values_take_no_part(bad):
+def test_missing_values_are_excluded(bad):
     """Of y alone, of one gradient, and of whole pixels; as least squares without."""
     y, g, h = problem((9, 10))
     y = y.at[2, 3, 0].set(bad).at[7, 7].set(bad)

@@ -98,14 +98,16 @@ def assert_accurate(data, bandwidth, **options):
     h = np.asarray(bandwidth)
     floor = options.pop("scale_floor", 0.1)
     expected = oracle([(target, gaussian(guide, h))], features, floor=floor, **options)
-    for dtype, most, median in ((np.float64, 1e-8, 1e-10), (np.float32, 1e-3, 1e-4)):
+    for dtype, maximum, median in ((np.float64, 1e-8, 1e-10), (np.float32, 1e-3, 1e-4)):
         arrays = [jnp.asarray(a, dtype) for a in (*data, h)]
         found = fit(*arrays, scale_floor=floor, **options)
         assert found.prediction.dtype == dtype
         error = errors(found, expected)
-        assert error.max() < most
+        assert error.max() < maximum
         assert np.median(error) < median
-        np.testing.assert_allclose(found.weight[..., 0], expected[1], rtol=100 * most)
+        np.testing.assert_allclose(
+            found.weight[..., 0], expected[1], rtol=100 * maximum
+        )
 
 
 @pytest.mark.parametrize(
@@ -224,7 +226,7 @@ def test_equal_features_with_the_ridge_shared_are_one_feature():
 
 
 @pytest.mark.parametrize("which", [0, 1, 2, 3])
-def test_a_bad_pixel_takes_no_part(which):
+def test_a_bad_pixel_is_excluded(which):
     data = [*images(13, 14, 2), RNG.uniform(0.1, 0.2, (13, 14, 1))]
     missing = data[0].copy()
     missing[4, 5] = np.nan
@@ -270,7 +272,7 @@ def test_vmap_is_a_loop():
         np.testing.assert_allclose(mapped.prediction[k], one.prediction, rtol=1e-10)
 
 
-def test_reverse_mode_does_not_remember_the_tiles():
+def test_reverse_mode_does_not_store_the_tiles():
     """Memory of the gradient stays far below the weights of all windows."""
     shapes = [jax.ShapeDtypeStruct((128, 128, c), jnp.float32) for c in (1, 1, 1)]
     total = lambda *i: fit(*i, 0.1, window=31).prediction.sum()

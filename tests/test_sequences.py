@@ -7,19 +7,22 @@ import numpy as np
 import pytest
 
 from experiments import large
-from jscomb import choice, exr
-from jscomb.cli import combining
+from jscomb import exr, methods
+from jscomb.cli import _combining
 from jscomb.numerics import tiles
 from tests.conftest import DATA
 
 GLASS, BOX = (DATA / f"cornell-{name}-64.exr" for name in ("glass", "box"))
 
 
-@pytest.mark.parametrize("method", choice.METHODS)
+LOCAL = [name for name, method in methods.METHODS.items() if method.plan is not None]
+
+
+@pytest.mark.parametrize("method", LOCAL)
 def test_methods_are_local(method, glass_frame):
     """By crops, and on a device as one of several, what they are as a whole."""
-    found = choice.local(jax.random.key(0), glass_frame, "oidn", method=method)
-    whole = np.asarray(found.function(found.images))
+    found = methods.plan(jax.random.key(0), glass_frame, method=method)
+    whole = np.asarray(found.whole())
     made = np.empty_like(whole)
     for where, part in tiles.stream_crops(**found._asdict(), tile=17):
         made[where] = part
@@ -31,8 +34,8 @@ def test_methods_are_local(method, glass_frame):
 @pytest.fixture
 def small_crops(monkeypatch):
     """Every frame is a large one."""
-    monkeypatch.setattr(combining, "LARGE", 1000)
-    monkeypatch.setattr(combining, "SAMPLED", 24)
+    monkeypatch.setattr(_combining, "LARGE", 1000)
+    monkeypatch.setattr(_combining, "SAMPLED", 24)
 
 
 def test_large_frames_are_the_same(jscomb, small_crops, monkeypatch, tmp_path):
@@ -40,9 +43,9 @@ def test_large_frames_are_the_same(jscomb, small_crops, monkeypatch, tmp_path):
     status, said, _ = jscomb("combine", GLASS, "-o", wide, "--method", "whitened")
     assert status == 0
     seen = []
-    within = tiles.tile_within
+    within = _combining.tile_within
     keep = lambda *args, **options: seen.append(within(*args, **options)) or 20
-    monkeypatch.setattr(tiles, "tile_within", keep)
+    monkeypatch.setattr(_combining, "tile_within", keep)
     crops = tmp_path / "crops.exr"
     assert jscomb("combine", GLASS, "-o", crops, "--method", "whitened")[0] == 0
     assert seen == [64]
@@ -51,7 +54,7 @@ def test_large_frames_are_the_same(jscomb, small_crops, monkeypatch, tmp_path):
     )
     status, said, _ = jscomb("combine", GLASS, "-o", crops)  # chooses by a sample
     assert status == 0
-    assert "by the half buffers, whitened" in said
+    assert "whitened: estimated change of relative L2" in said
     status, _, said = jscomb("combine", GLASS, "-o", crops, "--memory", "0")
     assert status == 2
     assert "the budget is 0 MiB" in said
@@ -88,11 +91,11 @@ def test_what_has_changed_is_made_anew(jscomb, tmp_path):
     command = ["combine", frame, "-o", out, "--method"]
     assert "there already" not in jscomb(*command, "whitened")[1]
     assert "there already" in jscomb(*command, "whitened")[1]
-    assert "there already" not in jscomb(*command, "kept")[1]
+    assert "there already" not in jscomb(*command, "denoised")[1]
     os.utime(frame, ns=(0, 0))
-    assert "there already" not in jscomb(*command, "kept")[1]
+    assert "there already" not in jscomb(*command, "denoised")[1]
     (out / "f.exr").write_bytes(b"no image")
-    assert "there already" not in jscomb(*command, "kept")[1]
+    assert "there already" not in jscomb(*command, "denoised")[1]
 
 
 def test_names_must_differ(jscomb, tmp_path):

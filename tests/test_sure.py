@@ -187,7 +187,7 @@ def test_bad_input():
         ValueError, match=r"made \(4, 5, 2\) of an image of \(8, 9, 2\)"
     ):
         run(lambda x: x[::2, ::2])
-    with pytest.raises(ValueError, match="variance must be at least zero, its least"):
+    with pytest.raises(ValueError, match="variance must be at least zero, its minimum"):
         run(v=VARIANCE - 0.1)
     with pytest.raises(ValueError, match="variance has shape"):
         run(v=VARIANCE[1:])

@@ -11,7 +11,8 @@ from jax.test_util import check_grads
 
 from jscomb import uncorrelated
 from jscomb.frame import make_frame
-from jscomb.uncorrelated.selection import powers
+from jscomb.numerics.windows import window_mean, window_sum
+from jscomb.uncorrelated._estimate import powers
 from tests.statistics import assert_mean
 
 combine = jax.jit(uncorrelated.combine, static_argnames="window")
@@ -87,7 +88,7 @@ def test_baselines():
     equal = lambda *_: 1.0
     u = uncorrelated.combine_uniform(y, z, window=5)
     far = lambda y, z: oracle(equal, y, z, z, 5) - np.mean(y, axis=0)
-    others = uncorrelated.combination.window_sum(jnp.ones((8, 9, 1)), 5) - 1
+    others = window_sum(jnp.ones((8, 9, 1)), 5) - 1
     expected = np.mean(y, axis=0) + far(y, z) * others / (others + 1)
     np.testing.assert_allclose(u, expected, rtol=1e-12)
     weigh, first, second = paper(0.2, 3), slice(2), slice(2, 4)
@@ -239,7 +240,7 @@ def test_gamma_is_the_brute_force_choice(stride, crossed):
         stride=stride, crosswise=crossed,
     )  # fmt: skip
     a, b = (0, 2), (1, 3)
-    level = uncorrelated.combination.window_mean(jnp.mean(y, axis=0), 5)
+    level = window_mean(jnp.mean(y, axis=0), 5)
     weight = 1 / (np.asarray(level) ** 2 + epsilon)
     expected = []
     for multiple in multiples:
@@ -275,22 +276,44 @@ def test_powers(exponents):
     np.testing.assert_allclose(found, [base**k for k in exponents], rtol=1e-12)
 
 
+def frame_pair(y, z, samples=64):
+    """Frames of sub-averages, normalised by one unit."""
+    y, z = (make_frame(i, samples=samples) for i in (y, z))
+    return y.normalised(), z.normalised(y.median_luminance)
+
+
 def test_frames():
-    """Gamma by quarters in units of the exposure, then halves of all samples."""
+    """Gamma by quarters of normalised radiance, then halves of all samples."""
     y, z = (10 * i for i in estimates((9, 8), sub_averages=8, channels=3))
-    frames = make_frame(y, samples=64), make_frame(z, samples=64)
-    found = uncorrelated.combine_frames(*frames, window=5)
-    e = frames[0].exposure
+    frames = frame_pair(y, z)
+    found = uncorrelated.combine_frame(*frames, window=5)
+    y, z = (f.buffers.color for f in frames)
     quarters = [jnp.mean(i.reshape(4, 2, 9, 8, 3), axis=1) for i in (y, z)]
-    gamma = uncorrelated.select_gamma(*(q / e for q in quarters), 16, window=5) / e**2
-    np.testing.assert_allclose(found.gamma, gamma, rtol=1e-12)
+    gamma = uncorrelated.select_gamma(*quarters, 16, window=5)
+    selected = uncorrelated.select_gamma_frame(*frames, window=5)
+    np.testing.assert_allclose(selected, gamma, rtol=1e-12)
     halves = [jnp.mean(i.reshape(2, 4, 9, 8, 3), axis=1) for i in (y, z)]
     image = combine(*halves, gamma, 32, window=5)
     np.testing.assert_allclose(found.image, image, rtol=1e-12)
-    assert found.variances.shape == (10,)
-    much = uncorrelated.combine_frames(*(f.scaled(1e3) for f in frames), window=5)
-    np.testing.assert_allclose(much.image, 1e3 * found.image, rtol=1e-10)
-    np.testing.assert_allclose(much.gamma, 1e-6 * found.gamma, rtol=1e-10)
+    much = frame_pair(1e4 * y, 1e4 * z)
+    bright = uncorrelated.combine_frame(*much, window=5)
+    np.testing.assert_allclose(bright.image, found.image, rtol=1e-10)
+
+
+def test_halves_of_frames():
+    """Each half pair by itself, where it has four sub-buffers; jit changes nothing."""
+    y, z = estimates((9, 8), sub_averages=16, channels=3)
+    frames = frame_pair(y, z)
+    found = uncorrelated.combine_frame(*frames, window=5)
+    pairs = zip(*(f.halves() for f in frames), strict=True)
+    for pair, image in zip(pairs, found.halves, strict=True):
+        alone = uncorrelated.combine_frame(*pair, window=5)
+        np.testing.assert_array_equal(image, alone.image)
+        assert alone.halves is not None
+    few = frames[0].merged(4), frames[1]
+    assert uncorrelated.combine_frame(*few, window=5).halves is None
+    jitted = jax.jit(lambda y, z: uncorrelated.combine_frame(y, z, window=5))(*frames)
+    np.testing.assert_allclose(jitted.halves, found.halves, rtol=1e-12)
 
 
 def test_gradients():
@@ -410,12 +433,21 @@ def test_bad_input(unchecked):
 
 def test_frames_that_are_not_alike():
     y, z = estimates((4, 5), sub_averages=4, channels=3)
-    frame = functools.partial(make_frame, samples=16)
+    call = uncorrelated.combine_frame
     with pytest.raises(
-        ValueError, match="correlated must have sub-buffers in a multip"
+        ValueError, match=r"sub-buffers in a multiple of 4, correlated has 2"
     ):
-        uncorrelated.combine_frames(frame(y), frame(z[:2]))
-    with pytest.raises(ValueError, match="independent: how many samples"):
-        uncorrelated.combine_frames(make_frame(y), frame(z))
-    with pytest.raises(ValueError, match=r"correlated has 8\.0 samples, independent"):
-        uncorrelated.combine_frames(frame(y), make_frame(z, samples=8))
+        call(*frame_pair(y, z[:2]))
+    with pytest.raises(ValueError, match="needs the samples a pixel of independent:"):
+        call(make_frame(y).normalised(2.0), make_frame(z, samples=8).normalised(2.0))
+    y, z = make_frame(y, samples=16), make_frame(z, samples=16)
+    with pytest.raises(ValueError, match="uncorrelated needs a normalised frame"):
+        call(y, z.normalised())
+    for other in (z, z.normalised()):
+        with pytest.raises(
+            ValueError, match=r"one unit: call correlated\.normalised\("
+        ):
+            call(y.normalised(), other)
+    few = z._replace(samples=z.samples / 2)
+    with pytest.raises(ValueError, match=r"independent has 16\.0, correlated 8\.0"):
+        call(y.normalised(2.0), few.normalised(2.0))

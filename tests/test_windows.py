@@ -101,14 +101,14 @@ def test_separable_sums_match_loops(shape):
 
 
 @pytest.mark.parametrize("window", [3, 15])
-def test_masked_pixels_take_no_part(window):
+def test_masked_pixels_are_excluded(window):
     image = images((6, 7, 2))
     mask = np.random.default_rng(1).random((6, 7, 1)) < 0.6
     mask[:3, :3] = False  # a window without any pixel
     hidden = jnp.asarray(np.where(mask, image, np.nan))
-    kept = np.where(mask, image, 0)
+    included = np.where(mask, image, 0)
     count = loop(np.broadcast_to(mask, image.shape).astype(float), window, np.sum)
-    total = loop(kept, window, np.sum)
+    total = loop(included, window, np.sum)
     np.testing.assert_allclose(
         windows.window_sum(hidden, window, mask=jnp.asarray(mask)), total, atol=1e-12
     )
@@ -236,6 +236,22 @@ def test_rejects_even_and_empty_windows(window):
             function(image, window)
     with pytest.raises(ValueError, match="window must be odd and positive"):
         windows.window_count((3, 3), window)
+
+
+@pytest.mark.parametrize("chain", [(), (1,), (7,), (3, 5), (15, 7, 7)])
+def test_reach_is_how_far_windows_in_turn_see(chain):
+    """Exactly: the pixel at the reach counts, the next one does not."""
+
+    def value(row):
+        image = row.reshape(1, -1, 1)
+        for window in chain:
+            image = windows.window_sum(image, window)
+        return image[0, 30, 0]
+
+    seen = np.flatnonzero(jax.grad(value)(jnp.zeros(61)))
+    assert windows.reach_of(*chain) == 30 - seen.min() == seen.max() - 30
+    with pytest.raises(ValueError, match="window must be odd and positive, got 4"):
+        windows.reach_of(*chain, 4)
 
 
 @pytest.mark.usefixtures("unchecked")

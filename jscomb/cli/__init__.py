@@ -15,8 +15,11 @@ from typing import Any
 import jax
 import tyro
 
-from jscomb.cli.combining import combine
-from jscomb.cli.showing import compare, demo, info
+from jscomb import methods
+from jscomb.cli._combining import combine
+from jscomb.cli._showing import compare, demo, info
+
+__all__ = ["main"]
 
 
 def main() -> None:
@@ -33,15 +36,17 @@ def main() -> None:
 
 
 def _parse() -> Callable[[], None]:
-    """The command line as a call to make; a wrong one is a `ValueError`."""
+    """Parse the command line into a call to make; a wrong one is a `ValueError`."""
 
     def later(command: Callable) -> Callable:
         @functools.wraps(command)
         def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return lambda: command(*args, **kwargs)
 
+        bind.__doc__ = (command.__doc__ or "").replace("{methods}", listed)
         return bind
 
+    listed = "; ".join(f"{n} ({m.summary})" for n, m in methods.METHODS.items())
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -60,7 +65,7 @@ def _parse() -> Callable[[], None]:
 def _use_compilation_cache() -> None:
     """Keep compiled programs in the user's cache, so the second run starts fast."""
     if jax.__version_info__ < (0, 10, 2):
-        return  # it would complain of every program that it finds there
+        return  # it would warn about every program that it finds there
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         folder = os.path.join(cache, "jscomb", "xla")

@@ -1,9 +1,27 @@
-"""Makers of biased images."""
+"""Denoisers: each has `denoise` on arrays and `denoise_frame(frame) -> Estimate`.
 
-from jscomb.denoisers import bilateral as bilateral
-from jscomb.denoisers import nfor as nfor
-from jscomb.denoisers import nonlocal_means as nonlocal_means
-from jscomb.denoisers import oidn as oidn
-from jscomb.denoisers import rdfc as rdfc
-from jscomb.denoisers import smoothing as smoothing
-from jscomb.denoisers.parts import of_parts as of_parts
+All but `oidn` are scale-equivariant and take any frame; `oidn` takes normalised ones.
+`kernel_predicting` needs a network. `NEEDS` of a module is what its `denoise_frame`
+needs of a frame. The estimate has halves where each half has what is needed. Local
+denoisers have `reach`, the distance in pixels that their results depend on.
+"""
+
+from jscomb.denoisers import (
+    bilateral,
+    kernel_predicting,
+    nfor,
+    nonlocal_means,
+    oidn,
+    rdfc,
+    smoothing,
+)
+
+__all__ = [
+    "bilateral",
+    "kernel_predicting",
+    "nfor",
+    "nonlocal_means",
+    "oidn",
+    "rdfc",
+    "smoothing",
+]

@@ -1,20 +1,21 @@
 r"""NFOR: nonlinearly weighted first-order regression on the renderer's features.
 
-A consistent denoiser without a network: as samples grow, weights fall on ever fewer
-pixels and the bias vanishes. Layout: images [H,W,C], linear radiance. In three steps:
+A consistent denoiser without a network: as samples grow, the weights concentrate on
+fewer pixels and the bias vanishes. Layout: images [H,W,C], linear radiance. Steps:
 
-    features    f, each half filtered by non-local means with weights of the other half
+    features    f of each half, by non-local means with the other half's weights
     regression  x_a by local_linear on the features, weights by non-local means on x_b,
-                once for each strength; and the other way round
-    mixing      of both strengths, by the share that makes the halves' error least
+                once for each strength; and with a and b exchanged
+    mixing      of both strengths, by the share that minimises the halves' error
 
-Target and weights come from different halves, so no fit follows its own noise.
+Target and weights come from different halves, so no fit follows its own noise. The
+result is not local: a mean over the whole image enters the mixing.
 
 Sources:
     B. Bitterli, F. Rousselle, B. Moon, J. Iglesias-Guitian, D. Adler, K. Mitchell,
     W. Jarosz, J. Novak, "Nonlinearly Weighted First-order Regression for Denoising
-    Monte Carlo Renderings", 2016. Our mixing share is the least-squares one over a
-    window, where the paper selects the better strength and filters the selection.
+    Monte Carlo Renderings", 2016. Our share is the least-squares one over a window; the
+    paper selects the better strength and filters the selection.
 """
 
 import jax
@@ -23,21 +24,30 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.denoisers import nonlocal_means
-from jscomb.denoisers.parts import of_parts
 from jscomb.features import select, stack
-from jscomb.frame import Biased, Frame
-from jscomb.numerics.guards import check_same_shape, divide, finite, first_finite
+from jscomb.frame import Estimate, Frame, Needs, with_halves
+from jscomb.numerics.guards import (
+    check_same_shape,
+    divide,
+    finite,
+    first_finite,
+    weighted_ratio,
+)
 from jscomb.numerics.regression import joint_local_linear
+from jscomb.numerics.tiles import compiled
 from jscomb.numerics.windows import window_mean, window_sum
 from jscomb.typing import Image, Scalar, Variance
 
-Features = Float[Array, "h w f"]
-# Of both halves, or with both strengths.
-Halves = Float[Array, "2 h w c"]
+__all__ = ["NEEDS", "denoise", "denoise_frame", "filter_features"]
 
-_POOL = 3  # width that sample variances are averaged over: as they are they mislead
+NEEDS = Needs(variance=True, halves=True, variance_of_halves=True)
+
+Features = Float[Array, "h w f"]
+Pair = Float[Array, "2 h w c"]  # of the halves, or of the strengths
+
+_POOL = 3  # width that sample variances are averaged over: single ones are too noisy
 _FEATURE_WINDOW, _FEATURE_STRENGTH = 11, 1.0  # of the features' pre-filter
-_LEAST = 1e-4  # of the mean square radiance; keeps black pixels from deciding
+_MINIMUM = 1e-4  # of the mean square radiance; keeps black pixels from dominating
 
 
 def denoise(
@@ -62,22 +72,22 @@ def denoise(
 
     Args:
         unbiased_a: x_a, radiance, shape [H,W,C].
-        unbiased_b: x_b, likewise, of other samples.
+        unbiased_b: x_b, of other samples, shape [H,W,C].
         variance_a: of the mean x_a, squared radiance, shape [H,W,C].
         variance_b: of x_b.
-        features_a: of half a, shape [H,W,F]; F may be 0. Pre-filter noisy ones.
+        features_a: of half a, shape [H,W,F]; F may be 0. Filter noisy ones first.
         features_b: of half b.
         window: width of the windows in pixels, odd.
         patch: width of the patches that non-local means compares, odd.
-        strengths: of non-local means, the narrower first.
+        strengths: of non-local means, > 0, the smaller first.
         stride: pixels between the centres of windows.
-        mixing: width of the window that the share of each strength is found over, odd.
-        ridge: of the regression.
+        mixing: width in pixels of the window that a share is solved for, odd.
+        ridge: of the regression, > 0.
 
     Returns:
-        both halves denoised, [H,W,C] each; they share their inputs, and their mean is
-        the denoised image. At an invalid pixel the half itself if finite, else the
-        other half, else 0.
+        both halves denoised, [H,W,C] each; they depend on each other, and their mean is
+        the denoised image. At an invalid pixel the half if finite, else the other half,
+        else 0.
 
     Raises:
         ValueError: while tracing, if shapes differ, a width is even, `stride` does not
@@ -101,8 +111,8 @@ def denoise(
         variance_b=variance_b,
     )
 
-    def fit(half: tuple[Image, Image, Variance, Features]) -> Halves:
-        """With either strength."""
+    def fit(half: tuple[Image, Image, Variance, Features]) -> Pair:
+        """One half with either strength."""
         x, guide, v, f = half
         noise = window_mean(v, _POOL, mask=finite(v))
 
@@ -119,9 +129,9 @@ def denoise(
 
     if not min(strengths) > 0:
         raise ValueError(f"strengths must be positive, got {strengths}")
-    # One after the other, by a program that is compiled once.
     x, v = jnp.stack([unbiased_a, unbiased_b]), jnp.stack([variance_a, variance_b])
     features = jnp.stack([features_b, features_a])
+    # `map`, not `vmap`: one program, and the memory of one fit.
     fits = lax.map(fit, (x, x[::-1], v[::-1], features))
     narrow, wide = jnp.moveaxis(fits, 1, 0)
     share = _narrow_share(narrow, wide, x[::-1], mixing)
@@ -130,45 +140,41 @@ def denoise(
 
 
 def _narrow_share(
-    narrow: Halves,
-    wide: Halves,
-    truth: Halves,
-    window: int,
+    narrow: Pair, wide: Pair, other: Pair, window: int
 ) -> Float[Array, "h w 1"]:
-    """The share s of the narrow fit with the least sum of (wide + s (n - w) - x)^2.
+    """Return the share s in [0, 1] that minimises the sum of (wide + s (n - w) - x)^2.
 
     x is the half that was not fitted, in place of the truth; the sum is over a window,
-    both halves and all channels. Pixels are weighed by their brightness, lest fireflies
-    decide.
+    both halves and all channels. Pixels are weighted by their inverse square radiance,
+    to avoid that fireflies dominate.
     """
-    known = finite(*truth)
-    along, square = jnp.zeros_like(narrow[0][..., :1]), 0.0
-    for n, w, x in zip(narrow, wide, truth, strict=True):
-        step, gap = n - w, jnp.where(known, x - w, 0.0)
+    valid = finite(*other)
+
+    def products(n: Image, w: Image, x: Image) -> tuple[Array, Array]:
+        step, gap = n - w, jnp.where(valid, x - w, 0.0)
         bright = jnp.mean(jnp.square(n), axis=-1, keepdims=True)
-        scale = bright + _LEAST * jnp.mean(bright)
-        weigh = lambda product, by=scale: divide(
-            jnp.sum(product, axis=-1, keepdims=True), by, where=by > 0
-        )
-        along += weigh(step * gap)
-        square += weigh(jnp.square(step))
+        scale = bright + _MINIMUM * jnp.mean(bright)
+        over = lambda each: weighted_ratio(jnp.sum(each, -1, keepdims=True), scale)
+        return over(step * gap), over(jnp.square(step))
+
     along, square = (
-        window_sum(jnp.asarray(i), window, mask=known) for i in (along, square)
+        window_sum(jnp.sum(each, axis=0), window, mask=valid)
+        for each in jax.vmap(products)(narrow, wide, other)
     )
     inside = (along > 0) & (along < square)
-    share = divide(along, square, where=inside)
-    return jnp.where(inside, share, jnp.where(along > 0, 1.0, 0.0).astype(share.dtype))
+    end = jnp.where(along > 0, jnp.ones_like(along), 0.0)
+    return divide(along, square, where=inside, otherwise=end)
 
 
 def filter_features(features_a: Features, features_b: Features) -> tuple[Image, Image]:
-    """Filter the noise of depth of field and motion out of both halves' features.
+    """Remove the noise of depth of field and motion from both halves' features.
 
     Args:
         features_a: of half a, shape [H,W,F].
-        features_b: of half b, of other samples, or the same if they are free of noise.
+        features_b: of half b, of other samples, or the same if without noise.
 
     Returns:
-        both, each by non-local means with the weights of the other, shape [H,W,F].
+        both, each filtered by non-local means with the other's weights, shape [H,W,F].
 
     Raises:
         ValueError: while tracing, if shapes differ.
@@ -200,28 +206,23 @@ def filter_features(features_a: Features, features_b: Features) -> tuple[Image, 
     return across(features_a, features_b), across(features_b, features_a)
 
 
-# Called with values, a loop over tiles would be compiled anew each time.
-_denoise = jax.jit(denoise, static_argnames=("window", "stride"))
-_filter_features = jax.jit(filter_features)
+def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Estimate:
+    """Denoise a frame from its two halves.
 
-
-def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
-    """Denoise a frame from its two halves, and each half by itself if it has halves.
-
-    Leaves out features that tell nothing, so it is not for `jit`.
+    Not for `jit`: constant features are excluded, to save time.
 
     Args:
-        frame: with two sub-buffers and their variances, or with four or more.
+        frame: with two sub-buffers and variances, or with four sub-buffers.
         window: width of the regression's windows in pixels, odd.
         stride: pixels between their centres.
 
     Returns:
-        the denoised frame; and its halves, if each of them is a frame that could be
-        denoised by itself: with four sub-buffers and variances, or eight or more.
+        the estimate; with halves if each half has two sub-buffers and variances, or
+        four sub-buffers.
 
     Raises:
-        ValueError: if the frame has no sub-buffers, or no way to know the variance, or
-            `window` is even, or `stride` does not fit it.
+        ValueError: if the frame has no halves with variances, `window` is even, or
+            `stride` does not fit it.
 
     Example:
         >>> import numpy as np
@@ -229,27 +230,26 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Biased:
         >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 8, 8, 1))
         >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
         >>> made = denoise_frame(frame, window=5)
-        >>> print(f"{frame.color.std():.2f} {made.full.std():.2f}", made.halves)
+        >>> print(f"{frame.color.std():.2f} {made.image.std():.2f}", made.halves)
         0.31 0.03 None
     """
+    frame.require("nfor", NEEDS)
     one = lambda part: _denoise_whole(part, window, stride)
-    return of_parts(frame, one, halves=True)
+    return with_halves(frame, one, needs=NEEDS)
 
 
 def _denoise_whole(frame: Frame, window: int, stride: int) -> Image:
-    """A frame from its two halves."""
+    """Denoise a frame from its two halves."""
     a, b = frame.halves()
     stacks = stack(a), stack(b)
     needed = select(stacks)
-    features = _filter_features(*(needed.of(s) for s in stacks))
-    both = _denoise(
+    features = compiled(filter_features)(*(needed.of(s) for s in stacks))
+    both = compiled(denoise, window=window, stride=stride)(
         a.color,
         b.color,
         a.variance,
         b.variance,
         *features,
-        window=window,
-        stride=stride,
         ridge=jnp.asarray(needed.ridge(0.1), frame.color.dtype),
     )
     return (both[0] + both[1]) / 2

@@ -1,9 +1,14 @@
-"""Networks that choose what the estimators leave open, and how they are trained.
+"""Networks that decide what the estimators leave open, and their training.
 
-`methods` combines a frame with the networks that come with the package, and loads
-others; `networks` are the papers'; `training` and `losses` make new ones. They need
-flax, which is slow to import, so they are imported by name::
+`recipes` defines what each network sees, how its output makes an image, and loads the
+parameters that come with the package; `networks` are the papers'; `training`, `losses`
+and `checkpoints` make and store others. `networks` and `recipes` import flax, which is
+slow, so modules are imported by name::
 
-    from jscomb.learning import methods
-    image = methods.combine_frame(jax.random.key(0), frame, "oidn", method="njs")
+    from jscomb.learning import recipes
+    recipe, network = recipes.RECIPES["njs"], recipes.shipped("njs")
+    inputs = recipe.inputs(jax.random.key(0), frame.normalised(), estimate)
+    image = recipe.combine(network, inputs)
 """
+
+__all__ = ["checkpoints", "losses", "networks", "recipes", "training"]  # pyright: ignore

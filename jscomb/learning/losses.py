@@ -1,31 +1,35 @@
-"""What the networks are trained to lower; `metrics.smape` is the others' loss."""
+"""Losses that networks are trained on; `metrics.smape` is another.
+
+Images [H,W,C], linear radiance, normalised.
+"""
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from jscomb.learning.networks import compress
 from jscomb.numerics.guards import check_same_shape
 from jscomb.typing import Image, Scalar
 
+__all__ = ["compress", "log_l2"]
+
 
 def log_l2(image: Image, reference: Image, *, epsilon: float = 0.01) -> Scalar:
-    """Relative squared error of signed logarithms.
+    """Return the relative squared error of signed logarithms.
 
-    A noisy reference only adds to it what does not depend on the image, as long as its
-    noise is small where it matters to the logarithm and the weight.
+    Noise of the reference only adds a constant, as long as it is small where it matters
+    to the logarithm and to the weight.
 
     Args:
-        image: linear radiance at an exposure of one, shape [H,W,C].
-        reference: likewise.
-        epsilon: what keeps black pixels from deciding.
+        image: normalised radiance, shape [H,W,C].
+        reference: normalised radiance, shape [H,W,C].
+        epsilon: added to the squared reference, so that black pixels do not dominate.
 
     Returns:
-        the mean over the elements.
+        the mean over pixels and channels.
 
     Raises:
         ValueError: while tracing, if shapes differ.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> one = jnp.ones((2, 2, 3))
         >>> print(f"{log_l2(3 * one, one):.3f}")
         0.980
@@ -36,3 +40,21 @@ def log_l2(image: Image, reference: Image, *, epsilon: float = 0.01) -> Scalar:
     found, truth = compress(image), compress(reference)
     weight = jnp.mean(jnp.square(truth), axis=-1, keepdims=True) + epsilon
     return jnp.mean(jnp.square(found - truth) / weight)
+
+
+def compress(image: Array) -> Array:
+    """Return the signed logarithm of radiance.
+
+    Args:
+        image: normalised radiance, any shape.
+
+    Returns:
+        sign(v) log(1 + |v|), same shape.
+
+    Example:
+        >>> print(compress(jnp.array([-1.0, 0.0, 1e6])).round(2))
+        [-0.69  0.   13.82]
+
+    Source: NJS eq. 14.
+    """
+    return jnp.sign(image) * jnp.log1p(jnp.abs(image))

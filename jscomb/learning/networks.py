@@ -1,21 +1,21 @@
-"""The papers' networks, as immutable callables of one image.
+"""The papers' networks, as immutable callables of one normalised image.
 
-Layout: images [H,W,C]; `vmap` for a batch. Every input is at an exposure of about one:
-the combiners divide by the frame's exposure before they call a network, so that what
-comes out is the same for a scene that is ten times as bright.
+Layout: images [H,W,C], normalised; `vmap` for a batch. Parameters are float32, from a
+typed key. Size "full" is the paper's, "light" has half the channels and a quarter of
+the work. `window` is the width in pixels, odd, of the kernels that a network predicts.
 
-Sizes: "full" is the paper's, "light" has half the channels and a quarter of the work.
-Parameters are drawn from a typed key, in float32; `window` is the width in pixels, odd,
-of the kernels that a network makes.
+Every network has a `reach`, the distance in rows or columns of the farthest input pixel
+that an output pixel depends on; crops have to start at multiples of its `multiple`.
 
-Away from the papers: radiance enters as log(1 + |.|) with its sign and variance as
-log(1 + ./0.01), since beside a firefly of 1e6 a network sees nothing else.
+Unlike the papers, radiance enters as log(1 + |.|) with its sign and variance as
+log(1 + ./0.01): beside a firefly of 1e6 a network sees nothing else.
 
-Sources: see the combiners; M. Kettunen, E. Harkonen, J. Lehtinen, "Deep convolutional
-reconstruction for gradient-domain rendering", 2019 (the signed logarithm).
+Sources: those of the combiners; M. Kettunen, E. Harkonen, J. Lehtinen, "Deep
+convolutional reconstruction for gradient-domain rendering", 2019 (signed logarithm).
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable
 from typing import Literal
 
 import jax
@@ -24,47 +24,36 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
-from jscomb.double_shrinkage.neural import Filters
-from jscomb.james_stein.neural import Parameters
+from jscomb.double_shrinkage import Filters
+from jscomb.james_stein import Parameters
+from jscomb.learning.losses import compress
 from jscomb.numerics.convolution import convolve
 from jscomb.numerics.kernels import Kernels
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Key, Variance
 
+__all__ = [
+    "Convolution",
+    "JamesSteinNetwork",
+    "Joint",
+    "KernelPredictor",
+    "MixingNetwork",
+    "ShrinkageNetwork",
+    "Size",
+    "UNet",
+]
+
 Size = Literal["light", "full"]
 
 _WIDTHS = {"full": (32, 64, 128), "light": (16, 32, 64)}  # of a U-Net's levels
 _MIXING_WIDTH = {"full": 48, "light": 24}
-_LEAST_WEIGHT = 1e-4  # NJS's, added to its weights
-_LARGEST_EXPONENT = 30.0  # of a confidence: beyond it there is no prior
-_VARIANCE_UNIT = 0.01  # squared radiance at an exposure of one
-
-
-def compress(image: Array) -> Array:
-    """The signed logarithm of radiance.
-
-    Args:
-        image: linear radiance at an exposure of one, any shape.
-
-    Returns:
-        sign(v) log(1 + |v|), same shape.
-
-    Example:
-        >>> print(compress(jnp.array([-1.0, 0.0, 1e6])).round(2))
-        [-0.69  0.   13.82]
-
-    Source: NJS eq. 14, for its loss.
-    """
-    return jnp.sign(image) * jnp.log1p(jnp.abs(image))
-
-
-def _compress_variance(variance: Array) -> Array:
-    """The logarithm of a squared radiance, steep where typical variances are."""
-    return jnp.log1p(variance / _VARIANCE_UNIT)
+_MINIMUM_WEIGHT = 1e-4  # NJS adds it to its weights
+_MAXIMUM_EXPONENT = 30.0  # of a confidence; beyond it the prior has no weight
+_VARIANCE_UNIT = 0.01  # squared normalised radiance
 
 
 class Convolution(nnx.Module):
-    """A convolution of an image that has zeros around it.
+    """A convolution of an image with a border of zeros.
 
     Attributes:
         kernel: shape [k,k,in,out].
@@ -86,37 +75,31 @@ class Convolution(nnx.Module):
 
     @property
     def reach(self) -> int:
-        """Rows to every side that a pixel depends on."""
+        """Distance of the farthest pixel that an output pixel depends on."""
         return self.kernel.shape[0] // 2
 
     def __call__(
         self, image: Float[Array, "_ w i"], *, inner: bool = False
     ) -> Float[Array, "_ w o"]:
-        """Convolve.
-
-        Args:
-            image: shape [H,W,in].
-            inner: only those rows of the result that have all their neighbours.
-
-        Returns:
-            shape [H,W,out], or `2 reach` rows less.
-        """
+        """Convolve; with `inner` only the rows that have all their neighbours."""
         kernel, bias = (p[...].astype(image.dtype) for p in (self.kernel, self.bias))
         rows = 0 if inner else self.reach
         return convolve(image, kernel, rows=rows) + bias.reshape(1, 1, -1)
 
 
 class UNet(nnx.Module):
-    """Two convolutions a level, three levels: halved by maxima, doubled by repetition.
+    """Three levels of two convolutions, with max pooling down and repetition up.
 
     Attributes:
         down: convolutions of each level on the way down.
-        up: likewise on the way up, coarsest first.
+        up: convolutions of each level on the way up, coarsest first.
 
     Example:
         >>> body = UNet(jax.random.key(0), 3, size="light")
         >>> print(jax.eval_shape(body, jnp.ones((7, 5, 3))).shape)
         (7, 5, 16)
+        >>> print(body.reach, body.multiple)
+        23 4
     """
 
     def __init__(self, key: Key, inputs: int, *, size: Size = "full"):
@@ -133,18 +116,40 @@ class UNet(nnx.Module):
         rising = list(zip(widths[:0:-1], widths[-2::-1], strict=True))
         self.up = nnx.List([pair(below + w, w) for below, w in rising])
 
+    @property
+    def multiple(self) -> int:
+        """Width of the blocks of pixels that are pooled to one."""
+        return 2 ** len(self.up)
+
+    @property
+    def reach(self) -> int:
+        """Distance of the farthest pixel that some pixel of a block depends on."""
+        spans = [(p, *self._span(p)) for p in range(self.multiple)]
+        return max(max(p - first, last - p) for p, first, last in spans)
+
+    def _span(self, pixel: int) -> tuple[int, int]:
+        """Return the first and last input pixel that an output pixel depends on.
+
+        Walks through the coarsest level, which sees all that the finer ones see.
+        """
+        first = last = pixel
+        for convolutions in reversed(self.up):
+            reach = _reach(convolutions)
+            first, last = (first - reach) // 2, (last + reach) // 2
+        *finer, coarsest = self.down
+        first, last = first - _reach(coarsest), last + _reach(coarsest)
+        for convolutions in reversed(finer):
+            reach = _reach(convolutions)
+            first, last = 2 * first - reach, 2 * last + 1 + reach
+        return first, last
+
     def __call__(self, image: Float[Array, "h w _"]) -> Float[Array, "h w _"]:
-        """Features of every pixel.
+        """Return features of every pixel, at least zero, as wide as the first level.
 
-        Args:
-            image: of any size; one that the levels do not divide is padded with zeros
-                and the result cut.
-
-        Returns:
-            at least zero, as many channels as the first level has.
+        Pads images that are not whole blocks with zeros.
         """
         height, width, _ = image.shape
-        block = 2 ** len(self.up)
+        block = self.multiple
         image = jnp.pad(image, ((0, -height % block), (0, -width % block), (0, 0)))
         levels = []
         for convolutions in self.down:
@@ -158,27 +163,24 @@ class UNet(nnx.Module):
         return image[:height, :width]
 
 
-def _each(convolutions: Sequence[Convolution], image: Array) -> Array:
-    """Convolutions one after another, each with a ReLU."""
-    for convolution in convolutions:
-        image = jax.nn.relu(convolution(image))
-    return image
+class _Headed(nnx.Module):
+    """A U-Net with convolutions side by side on its features."""
+
+    body: UNet
+
+    @property
+    def multiple(self) -> int:
+        """Width of the blocks of pixels that are pooled to one."""
+        return self.body.multiple
+
+    @property
+    def reach(self) -> int:
+        """Distance of the farthest pixel that the outputs of a pixel depend on."""
+        heads = [h for h in vars(self).values() if isinstance(h, Convolution)]
+        return self.body.reach + max(head.reach for head in heads)
 
 
-def _halved(image: Array) -> Array:
-    """The largest of each block of 2x2 pixels."""
-    h, w, c = image.shape
-    return jnp.max(image.reshape(h // 2, 2, w // 2, 2, c), axis=(1, 3))
-
-
-def _doubled(image: Array) -> Array:
-    """Each pixel as a block of 2x2."""
-    h, w, c = image.shape
-    blocks = jnp.broadcast_to(image[:, None, :, None], (h, 2, w, 2, c))
-    return blocks.reshape(2 * h, 2 * w, c)
-
-
-class JamesSteinNetwork(nnx.Module):
+class JamesSteinNetwork(_Headed):
     """Which variance each window has, and which half's regression to trust.
 
     Attributes:
@@ -206,32 +208,25 @@ class JamesSteinNetwork(nnx.Module):
     def __call__(
         self, unbiased: Image, variance: Variance, biased_a: Image, biased_b: Image
     ) -> Parameters:
-        """Parameters of `james_stein.neural_combine`.
+        """Return w² kernel weights a pixel and alpha for `james_stein.neural_combine`.
 
-        Args:
-            unbiased: x at an exposure of one, finite, shape [H,W,3].
-            variance: v, likewise.
-            biased_a: y^_a, likewise.
-            biased_b: y^_b, likewise.
-
-        Returns:
-            w² kernel weights a pixel and alpha.
+        Takes its x, v, y^_a and y^_b, normalised and finite.
         """
         v = _compress_variance(variance)
         radiance = [compress(i) for i in (unbiased, biased_a, biased_b)]
         features = self.body(jnp.concatenate([*radiance, v], axis=-1))
-        head = lambda f: jax.nn.relu(self.kernels(f, inner=True)) + _LEAST_WEIGHT
+        head = lambda f: jax.nn.relu(self.kernels(f, inner=True)) + _MINIMUM_WEIGHT
         alpha = jax.nn.sigmoid(self.share(features))
         return Parameters(Kernels(features, head, self.kernels.reach), alpha)
 
 
-class ShrinkageNetwork(nnx.Module):
+class ShrinkageNetwork(_Headed):
     """How to pool the errors of two integrators, and how far to trust the prior.
 
     Attributes:
         body: U-Net.
         kernels: projection to two kernels.
-        confidence: projection to the logarithm of eta^2.
+        confidence: projection to the logarithm of eta².
 
     Example:
         >>> network = ShrinkageNetwork(jax.random.key(0), size="light")
@@ -260,32 +255,18 @@ class ShrinkageNetwork(nnx.Module):
         variance: Float[Array, "h w 1"],
         mse: Float[Array, "h w 1"],
     ) -> Filters:
-        """Parameters of `double_shrinkage.neural_combine`.
+        """Return two kernels a pixel and eta² for `double_shrinkage.neural_combine`.
 
-        Args:
-            prior: p at an exposure of one, finite, shape [H,W,3].
-            unbiased: u, likewise.
-            biased: b, likewise.
-            variance: v, mean over channels, shape [H,W,1].
-            mse: m, likewise.
-
-        Returns:
-            two softmax kernels a pixel and eta^2.
+        Takes its p, u, b, v and m, normalised and finite.
         """
         radiance = [compress(i) for i in (prior, unbiased, biased)]
         errors = [_compress_variance(e) for e in (variance, mse)]
         features = self.body(jnp.concatenate([*radiance, *errors], axis=-1))
         exponent = jnp.clip(
-            self.confidence(features), -_LARGEST_EXPONENT, _LARGEST_EXPONENT
+            self.confidence(features), -_MAXIMUM_EXPONENT, _MAXIMUM_EXPONENT
         )
         head = lambda f: _softmax(self.kernels(f), parts=2)
         return Filters(Kernels(features, head, self.kernels.reach), jnp.exp(exponent))
-
-
-def _softmax(logits: Array, *, parts: int) -> Array:
-    """Softmax of each part of the channels."""
-    split = jnp.split(logits, parts, axis=-1)
-    return jnp.concatenate([jax.nn.softmax(part) for part in split], axis=-1)
 
 
 class MixingNetwork(nnx.Module):
@@ -299,11 +280,13 @@ class MixingNetwork(nnx.Module):
     Example:
         >>> network = MixingNetwork(jax.random.key(0), size="light")
         >>> x = jnp.ones((6, 4, 3))
-        >>> print(jax.eval_shape(network, x, x, x, x).shape)
-        (6, 4, 3, 3)
+        >>> print(jax.eval_shape(network, x, x, x, x).shape, network.reach)
+        (6, 4, 3, 3) 7
 
     Source: PD section 4.3, figure 6.
     """
+
+    multiple = 1
 
     def __init__(self, key: Key, *, size: Size = "full"):
         """Draw all convolutions."""
@@ -314,21 +297,17 @@ class MixingNetwork(nnx.Module):
         self.blocks = nnx.List([nnx.List(pair()) for _ in range(2)])
         self.last = Convolution(next(keys), width, 9)
 
+    @property
+    def reach(self) -> int:
+        """Distance of the farthest pixel that an output pixel depends on."""
+        return _reach([self.first, *itertools.chain(*self.blocks), self.last])
+
     def __call__(
         self, unbiased: Image, biased: Image, variance: Variance, sure: Image
     ) -> Float[Array, "h w 3 3"]:
-        """Outputs for `progressive.activation`.
+        """Return xi_1, xi_2 and xi_3 of each channel for `progressive.activation`.
 
-        Args:
-            unbiased: x at an exposure of one, finite, shape [H,W,3].
-            biased: y, likewise.
-            variance: v, likewise.
-            sure: s, likewise, of either sign.
-
-        Returns:
-            xi_1, xi_2, xi_3 of each channel, shape [H,W,3,3].
-
-        Source: PD eq. 19.
+        Takes x, y, v and s of `progressive.combine`, normalised and finite; PD eq. 19.
         """
         square = jnp.square(unbiased - biased)
         errors = [variance, sure, square, sure + variance - square]
@@ -341,8 +320,8 @@ class MixingNetwork(nnx.Module):
         return outputs.reshape(*outputs.shape[:2], 3, 3)
 
 
-class KernelPredictor(nnx.Module):
-    """A small kernel-predicting denoiser: a biased image to learn jointly.
+class KernelPredictor(_Headed):
+    """A small kernel-predicting denoiser: an image to learn jointly with a combiner.
 
     Attributes:
         body: U-Net.
@@ -373,15 +352,9 @@ class KernelPredictor(nnx.Module):
     def __call__(
         self, unbiased: Image, variance: Variance, features: Float[Array, "h w f"]
     ) -> Kernels:
-        """Kernels of `denoisers.kernel_predicting.denoise`.
+        """Return w² weights a pixel, of sum one, for `kernel_predicting.denoise`.
 
-        Args:
-            unbiased: x at an exposure of one, finite, shape [H,W,3].
-            variance: v, likewise.
-            features: of a range of about one, shape [H,W,F].
-
-        Returns:
-            w² weights a pixel of sum one.
+        Takes its x, v and features, normalised and finite.
         """
         inputs = [compress(unbiased), _compress_variance(variance), features]
         body = self.body(jnp.concatenate(inputs, axis=-1))
@@ -409,3 +382,39 @@ class Joint(nnx.Module):
         first, second = jax.random.split(key)
         self.denoiser = KernelPredictor(first, size=size)
         self.combiner = JamesSteinNetwork(second, size=size)
+
+
+def _compress_variance(variance: Array) -> Array:
+    """Return the logarithm of a variance, steep where typical variances are."""
+    return jnp.log1p(variance / _VARIANCE_UNIT)
+
+
+def _each(convolutions: Iterable[Convolution], image: Array) -> Array:
+    """Apply convolutions one after another, each with a ReLU."""
+    for convolution in convolutions:
+        image = jax.nn.relu(convolution(image))
+    return image
+
+
+def _reach(convolutions: Iterable[Convolution]) -> int:
+    """Return the reach of convolutions one after another."""
+    return sum(convolution.reach for convolution in convolutions)
+
+
+def _halved(image: Array) -> Array:
+    """Return the maximum of each block of 2x2 pixels."""
+    h, w, c = image.shape
+    return jnp.max(image.reshape(h // 2, 2, w // 2, 2, c), axis=(1, 3))
+
+
+def _doubled(image: Array) -> Array:
+    """Repeat each pixel as a block of 2x2."""
+    h, w, c = image.shape
+    blocks = jnp.broadcast_to(image[:, None, :, None], (h, 2, w, 2, c))
+    return blocks.reshape(2 * h, 2 * w, c)
+
+
+def _softmax(logits: Array, *, parts: int) -> Array:
+    """Return the softmax of each part of the channels."""
+    split = jnp.split(logits, parts, axis=-1)
+    return jnp.concatenate([jax.nn.softmax(part) for part in split], axis=-1)

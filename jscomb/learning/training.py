@@ -1,7 +1,9 @@
 """Training: draw crops, lower a loss by Adam under a one-cycle schedule.
 
-A run is a frozen configuration. Its step k draws with the key k of the seed, so a run
-that goes on from a saved state does what one without a pause would have done.
+A run is a frozen configuration. Step k draws with the key k of the seed, so a run that
+is resumed from a saved state equals one without interruption.
+
+Images [H,W,C], linear radiance, normalised.
 """
 
 import dataclasses
@@ -16,6 +18,8 @@ from jaxtyping import Array, Float
 
 from jscomb.typing import Image, Key, Scalar
 
+__all__ = ["Examples", "Schedule", "State", "draw", "evaluate", "run", "start"]
+
 Network = Any  # a pytree of parameters that can be called
 Objective = Callable[[Network, dict[str, Image], Image, Scalar], Scalar]
 
@@ -29,7 +33,7 @@ class Schedule:
         batch: crops a step.
         crop: width and height of a crop in pixels.
         rate: learning rate at the peak of the cycle.
-        jitter: largest factor of two that the exposure is off by, either way.
+        jitter: the unit of radiance is drawn from 2^-jitter to 2^jitter.
         seed: of the parameters and of all draws.
     """
 
@@ -41,17 +45,17 @@ class Schedule:
     seed: int = 0
 
     def optimiser(self) -> optax.GradientTransformation:
-        """Adam; steps of an unlikely size are cut, as fireflies make them."""
+        """Return Adam with clipped gradients, because of fireflies."""
         rate = optax.cosine_onecycle_schedule(self.steps, self.rate)
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
 
 
 class Examples(NamedTuple):
-    """Frames to learn from, of one size.
+    """N frames to learn from, of one size.
 
     Attributes:
-        inputs: at an exposure of one, [N,V,H,W,C] each; V variants of each frame.
-        reference: likewise, [N,H,W,3].
+        inputs: of a recipe, normalised, [N,V,H,W,C] each; V variants of each frame.
+        reference: normalised radiance, [N,H,W,3].
     """
 
     inputs: dict[str, Float[Array, "n v h w _"]]
@@ -59,12 +63,12 @@ class Examples(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where a run stands.
+    """The state of a run.
 
     Attributes:
         network: its parameters.
         optimiser: Adam's moments.
-        step: steps done.
+        step: number of steps done.
     """
 
     network: Network
@@ -73,10 +77,10 @@ class State(NamedTuple):
 
 
 def start(network: Network, schedule: Schedule) -> State:
-    """The state before the first step.
+    """Return the state before the first step.
 
     Args:
-        network: as drawn.
+        network: initial parameters.
         schedule: how to train.
 
     Returns:
@@ -97,13 +101,14 @@ def run(
     """Train from a state to the end of the schedule.
 
     Args:
-        objective: loss of a network, one frame's inputs, its reference and an exposure.
-        state: where to go on.
+        objective: loss of a network, the inputs and the reference of a crop, and the
+            unit of radiance to measure both in.
+        state: to start from.
         examples: to draw crops from.
         schedule: how to train.
 
     Yields:
-        after each step the state and the loss of its batch.
+        the state after each step, and the loss of its batch.
 
     Raises:
         ValueError: if the crops are larger than the frames.
@@ -126,7 +131,7 @@ def run(
 
     @jax.jit
     def step(state: State, examples: Examples) -> tuple[State, Scalar]:
-        """One of the optimiser."""
+        """Take one step of the optimiser."""
         keys = jax.random.split(jax.random.fold_in(seed, state.step), schedule.batch)
         of_network = lambda network: _batch_loss(
             objective, network, keys, examples, schedule
@@ -147,12 +152,12 @@ def run(
 def evaluate(
     objective: Objective, network: Network, examples: Examples
 ) -> Float[Array, " n"]:
-    """Loss of every whole frame in its first variant, at its own exposure.
+    """Return the loss of every whole frame in its first variant, in a unit of one.
 
     Args:
         objective: as for `run`.
-        network: to be judged.
-        examples: frames.
+        network: to evaluate.
+        examples: N frames.
 
     Returns:
         the losses, shape [N].
@@ -173,16 +178,15 @@ def evaluate(
 def draw(
     key: Key, examples: Examples, schedule: Schedule
 ) -> tuple[dict[str, Image], Image, Scalar]:
-    """A crop of some frame, turned and flipped, its colours exchanged.
+    """Draw a crop of a frame, with random flips, transposition and order of channels.
 
     Args:
         key: a typed key.
         examples: frames.
-        schedule: the crop's size and how far the exposure may be off.
+        schedule: sets the crop's size and the range of the unit.
 
     Returns:
-        inputs and reference, as wide and high as the crop, and the exposure that the
-        network is to believe.
+        the crop's inputs and reference, and a unit of radiance to measure both in.
 
     Example:
         >>> x = jnp.ones((2, 1, 8, 8, 3))
@@ -192,7 +196,7 @@ def draw(
         >>> print(inputs["x"].shape, reference.shape)
         (4, 4, 3) (4, 4, 3)
     """
-    which, variant, corner, turns, colours, exposure = jax.random.split(key, 6)
+    which, variant, corner, turns, colours, unit = jax.random.split(key, 6)
     frames, height, width, _ = examples.reference.shape
     frame = jax.random.randint(which, (), 0, frames)
     size = schedule.crop
@@ -214,7 +218,7 @@ def draw(
         return image[..., order] if c == 3 else image
 
     inputs = {name: cut(array, frame, way) for name, array in examples.inputs.items()}
-    off = jax.random.uniform(exposure, (), examples.reference.dtype, -1.0, 1.0)
+    off = jax.random.uniform(unit, (), examples.reference.dtype, -1.0, 1.0)
     return inputs, cut(examples.reference, frame), 2 ** (schedule.jitter * off)
 
 
@@ -225,6 +229,6 @@ def _batch_loss(
     examples: Examples,
     schedule: Schedule,
 ) -> Scalar:
-    """Mean loss of one crop a key."""
+    """Return the mean loss of one crop a key."""
     one = lambda key: objective(network, *draw(key, examples, schedule))
     return jnp.mean(jax.vmap(one)(keys))

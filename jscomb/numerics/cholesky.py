@@ -4,23 +4,24 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+__all__ = ["solve"]
+
 
 def solve(
     matrix: Float[Array, "f f m"],
     right: Float[Array, "f c m"],
-    least: Float[Array, "f _"],
+    minimum: Float[Array, "f _"],
 ) -> Float[Array, "f c m"]:
-    """Solve M systems of F unknowns; matrices and right sides are reduced together.
+    """Solve M systems of F unknowns, each with C right sides.
 
     Args:
-        matrix: symmetric, positive definite but for rounding, shape [F,F,M].
-        right: C right sides each, shape [F,C,M].
-        least: > 0, what no pivot of the exact matrices is below (for a semidefinite
-            matrix plus a ridge, the ridge), shape [F,M] or [F,1].
+        matrix: symmetric, positive definite up to rounding, shape [F,F,M].
+        right: right sides, shape [F,C,M].
+        minimum: > 0, a lower bound on the pivots of the exact matrix (for a
+            semidefinite matrix plus a ridge, the ridge), shape [F,M] or [F,1].
 
     Returns:
-        the solutions, shape [F,C,M]; finite, also where rounding makes a pivot
-        negative.
+        the solutions, shape [F,C,M]; finite even where rounding makes a pivot negative.
 
     Example:
         >>> matrix = jnp.array([[2.0, 1.0], [1.0, 2.0]])[..., None]
@@ -32,7 +33,7 @@ def solve(
     rest = jnp.concatenate([matrix, jnp.moveaxis(right, 1, 0)])
     columns, roots = [], []
     for k in range(f):
-        root = lax.rsqrt(jnp.maximum(rest[0, 0], least[k]))
+        root = lax.rsqrt(jnp.maximum(rest[0, 0], minimum[k]))
         column = rest[1:, 0] * root[None]
         columns.append(column)
         roots.append(root)

@@ -1,7 +1,7 @@
-"""Convolution of an image, fast forwards and backwards on a CPU.
+"""Convolution of an image, fast forward and backward on a CPU.
 
-XLA's own is fast there but for its derivative in the kernel. That is a matrix product
-of patches here, some rows at a time: two or three times as fast.
+XLA's own is fast there except for its derivative in the kernel. Here that derivative is
+a matrix product of patches, some rows at a time: two to three times as fast.
 """
 
 import functools
@@ -14,25 +14,27 @@ from jaxtyping import Array, Float
 
 from jscomb.numerics.tiles import map_rows
 
-_PATCH_ROWS = 8  # at once
+__all__ = ["convolve"]
+
+_PATCH_ROWS = 8  # rows of patches in memory at once
 
 
 def convolve(
     image: Float[Array, "_ w i"], kernel: Float[Array, "k k i o"], *, rows: int
 ) -> Float[Array, "_ w o"]:
-    """Correlate an image that has zeros around it with a kernel.
+    """Correlate an image, zero outside, with a kernel.
 
     Args:
         image: shape [H,W,in].
         kernel: shape [k,k,in,out], k odd.
-        rows: of zeros above and below the image: k // 2 for a result of H rows, 0 for
-            only those rows that have all their neighbours.
+        rows: rows of zeros above and below the image: k // 2 for a result of H rows, 0
+            for only those rows that have all their neighbours.
 
     Returns:
         shape [H + 2 rows - (k - 1),W,out].
 
     Raises:
-        ValueError: while tracing, if there are more rows than the kernel reaches.
+        ValueError: while tracing, if `rows` is larger than the kernel's reach.
 
     Example:
         >>> import jax.numpy as jnp
@@ -46,8 +48,8 @@ def convolve(
     return _convolve(image, kernel, rows)
 
 
-def _of_xla(image: Array, kernel: Array, rows: int) -> Array:
-    """XLA's convolution."""
+def _by_xla(image: Array, kernel: Array, rows: int) -> Array:
+    """Convolve by XLA."""
     reach = kernel.shape[0] // 2
     return lax.conv_general_dilated(
         image[None],
@@ -58,24 +60,24 @@ def _of_xla(image: Array, kernel: Array, rows: int) -> Array:
     )[0]
 
 
-_convolve = jax.custom_jvp(_of_xla, nondiff_argnums=(2,))
+_convolve = jax.custom_jvp(_by_xla, nondiff_argnums=(2,))
 
 
 @functools.partial(_convolve.defjvp, symbolic_zeros=True)
 def _convolve_jvp(rows: int, primals, tangents) -> tuple[Array, Array]:
-    """Linear in both; the part in the kernel so that its transpose is fast."""
-    (image, kernel), (moved, changed) = primals, tangents
+    """Differentiate; the term in the kernel has a fast transpose."""
+    (image, kernel), (image_dot, kernel_dot) = primals, tangents
     result = _convolve(image, kernel, rows)
-    parts = []
-    if not isinstance(moved, SymbolicZero):
-        parts.append(_of_xla(moved, kernel, rows))
-    if not isinstance(changed, SymbolicZero):
-        parts.append(_of_patches(image, changed, rows))
-    return result, sum(parts, start=jnp.zeros_like(result))
+    terms = []
+    if not isinstance(image_dot, SymbolicZero):
+        terms.append(_by_xla(image_dot, kernel, rows))
+    if not isinstance(kernel_dot, SymbolicZero):
+        terms.append(_by_patches(image, kernel_dot, rows))
+    return result, sum(terms, start=jnp.zeros_like(result))
 
 
-def _of_patches(image: Array, kernel: Array, rows: int) -> Array:
-    """The same as a product of patches and the kernel, a strip of rows at a time."""
+def _by_patches(image: Array, kernel: Array, rows: int) -> Array:
+    """Convolve by a product of patches and the kernel, a strip of rows at a time."""
     size, _, inputs, outputs = kernel.shape
     reach, (height, width, _) = size // 2, image.shape
     matrix = kernel.reshape(size * size * inputs, outputs)

@@ -1,9 +1,11 @@
-"""The conventions for ugly input, said once: shapes, invalid pixels, division.
+"""Guards against corrupt input: shapes, invalid pixels, divisions and square roots.
 
-A pixel that is not finite in any input of a combiner is *invalid*: it takes no part in
-any window, and the output there is the first finite of (biased, unbiased), else 0.
-Images are `[H, W, C]`; a pixel is invalid with all its channels.
+A pixel that is not finite in some input of a combiner is *invalid*, with all its
+channels: every window excludes it, and the output there is the first finite of (biased,
+unbiased), else 0. Layout: images [H,W,C].
 """
+
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +15,24 @@ from jaxtyping import Array, Bool, Float
 
 from jscomb.typing import Image, Mask
 
+__all__ = [
+    "check_not_negative",
+    "check_same_shape",
+    "divide",
+    "finite",
+    "first_finite",
+    "masked_mean",
+    "safe_sqrt",
+    "weighted_ratio",
+    "zero_invalid",
+]
+
 
 def check_same_shape(**images: Float[Array, "..."]) -> None:
-    """Raise unless every image is `[H, W, C]` and of the first one's shape.
+    """Raise unless all images have one shape [H,W,C].
 
     Args:
-        images: the arrays by the names that the caller's user knows.
+        images: arrays by the names that the user knows.
 
     Returns:
         nothing.
@@ -45,42 +59,41 @@ def check_same_shape(**images: Float[Array, "..."]) -> None:
 
 
 def check_not_negative(**images: Float[Array, "..."]) -> None:
-    """Raise if a value is negative; while tracing nothing is known, nothing raised.
+    """Raise if a value is negative; never while tracing, when values are unknown.
 
     Args:
-        images: the arrays by the names that the caller's user knows.
+        images: arrays by the names that the user knows.
 
     Returns:
         nothing.
 
     Raises:
-        ValueError: names the array and its least value.
+        ValueError: names the array and its minimum.
 
     Example:
         >>> check_not_negative(variance=jnp.array([1.0, -0.5]))
         Traceback (most recent call last):
             ...
-        ValueError: variance must be at least zero, its least is -0.5
+        ValueError: variance must be at least zero, its minimum is -0.5
     """
     for name, image in images.items():
         if isinstance(image, Tracer):
             continue
-        least = np.nanmin(np.asarray(image), initial=0.0)  # jnp would be traced
-        if least < 0:
-            raise ValueError(f"{name} must be at least zero, its least is {least}")
+        minimum = np.nanmin(np.asarray(image), initial=0.0)  # jnp would be traced
+        if minimum < 0:
+            raise ValueError(f"{name} must be at least zero, its minimum is {minimum}")
 
 
 def finite(*images: Float[Array, "h w _"]) -> Mask:
-    """Pixels that are finite in every channel of every image.
+    """Return which pixels are finite in every channel of every image.
 
     Args:
-        images: any number of images of one size, their channels may differ.
+        images: any number of images of one size; channels may differ.
 
     Returns:
         the mask, shape [H,W,1].
 
     Example:
-        >>> import jax.numpy as jnp
         >>> print(finite(jnp.array([[[1.0, jnp.nan], [1.0, 2.0]]]))[..., 0])
         [[False  True]]
     """
@@ -88,11 +101,36 @@ def finite(*images: Float[Array, "h w _"]) -> Mask:
     return jnp.all(jnp.stack(masks), axis=0)
 
 
-def first_finite(*images: Image) -> Image:
-    """At each pixel the first image that is finite there, else 0.
+def zero_invalid(*images: Float[Array, "..."]) -> tuple[Mask, *tuple[Array, ...]]:
+    """Return which pixels are finite in every image, and the images with 0 elsewhere.
 
     Args:
-        images: candidates in the order of preference, shape [H,W,C] each.
+        images: images [H,W,C] or stacks [N,H,W,C] of one size; channels may differ.
+
+    Returns:
+        the mask, shape [H,W,1], then the images.
+
+    Example:
+        >>> x, v = jnp.array([[[1.0], [2.0]]]), jnp.array([[[jnp.nan], [4.0]]])
+        >>> valid, x, v = zero_invalid(x, v)
+        >>> print(valid[0, :, 0], x[0, :, 0], v[0, :, 0])
+        [False  True] [0. 2.] [0. 4.]
+    """
+    valid = finite(*(i for image in images for i in _images(image)))
+    mask = lambda image: valid if image.ndim == 3 else valid[None]
+    return valid, *(jnp.where(mask(image), image, 0.0) for image in images)
+
+
+def _images(image: Array) -> Iterable[Array]:
+    """Return the images of a stack, or the image alone."""
+    return [image] if image.ndim == 3 else image
+
+
+def first_finite(*images: Image) -> Image:
+    """Return at each pixel the first image that is finite there, else 0.
+
+    Args:
+        images: in the order of preference, shape [H,W,C].
 
     Returns:
         the image, finite everywhere, shape [H,W,C].
@@ -115,7 +153,7 @@ def divide(
     where: Bool[Array, "*n"],
     otherwise: Float[Array, "*n"] | float = 0.0,
 ) -> Float[Array, "*n"]:
-    """A quotient whose value and derivatives are finite wherever the true ones are.
+    """Return a quotient that is finite wherever the true one is; so its derivatives.
 
     The denominator is made safe before the division, and the derivative is written as
     -(n/d)/d, because -n/d^2 leaves the range of float32 below d = 1e-19.
@@ -123,14 +161,13 @@ def divide(
     Args:
         numerator: n, any shape and unit.
         denominator: d, same shape; not zero where it is used.
-        where: the elements to divide.
-        otherwise: the value of all others; no derivative passes to n or d there.
+        where: elements to divide, same shape.
+        otherwise: value of all others; no derivative passes to n or d there.
 
     Returns:
         n/d or `otherwise`, same shape.
 
     Example:
-        >>> import jax, jax.numpy as jnp
         >>> n, d = jnp.array([1.0, 1.0]), jnp.array([4.0, 0.0])
         >>> print(divide(n, d, where=d > 0))
         [0.25 0.  ]
@@ -141,7 +178,7 @@ def divide(
 
 @jax.custom_jvp
 def _quotient(numerator: Array, denominator: Array) -> Array:
-    """n/d with derivatives of every order that never square d."""
+    """Return n/d; its derivatives of every order never square d."""
     return numerator / denominator
 
 
@@ -149,7 +186,83 @@ def _quotient(numerator: Array, denominator: Array) -> Array:
 def _quotient_jvp(
     primals: tuple[Array, Array], tangents: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """d(n/d) = (dn - (n/d) dd) / d."""
+    """Return d(n/d) = (dn - (n/d) dd) / d."""
     (n, d), (dn, dd) = primals, tangents
     quotient = _quotient(n, d)
     return quotient, _quotient(dn - quotient * dd, d)
+
+
+def weighted_ratio(
+    total: Float[Array, "*n c"],
+    weight: Float[Array, "*n _"],
+    *,
+    otherwise: Float[Array, "*n c"] | float = 0.0,
+) -> Float[Array, "*n c"]:
+    """Return total / weight where the weight is positive.
+
+    Args:
+        total: weighted sums, any unit, shape [...,C].
+        weight: sums of the weights, at least zero, shape [...,C] or [...,1].
+        otherwise: the value where the weight is 0.
+
+    Returns:
+        the weighted means, shape [...,C], with finite derivatives.
+
+    Example:
+        >>> total, weight = jnp.array([[6.0, 3.0]]), jnp.array([[2.0]])
+        >>> print(weighted_ratio(total, weight), weighted_ratio(total, 0 * weight))
+        [[3.  1.5]] [[0. 0.]]
+    """
+    weight = jnp.broadcast_to(weight, total.shape)
+    return divide(total, weight, where=weight > 0, otherwise=otherwise)
+
+
+def masked_mean(
+    values: Float[Array, "h w c"],
+    mask: Mask | None,
+    *,
+    per_channel: bool = False,
+    otherwise: float = 0.0,
+) -> Array:
+    """Return the mean over the pixels that a mask selects.
+
+    Args:
+        values: any unit, shape [H,W,C]; may hold anything where the mask is False.
+        mask: pixels to average, shape [H,W,1]; None for all.
+        per_channel: keep channels apart.
+        otherwise: the result if the mask selects no pixel.
+
+    Returns:
+        the mean over pixels and channels, shape []; or over pixels, shape [1,1,C].
+
+    Example:
+        >>> values = jnp.array([[[1.0], [3.0], [jnp.nan]]])
+        >>> print(masked_mean(values, finite(values)))
+        2.0
+    """
+    axes = (0, 1) if per_channel else None
+    if mask is None:
+        return jnp.mean(values, axis=axes, keepdims=per_channel)
+    total = jnp.sum(jnp.where(mask, values, 0.0), axis=axes, keepdims=per_channel)
+    pixels = jnp.sum(mask).astype(values.dtype)
+    count = jnp.broadcast_to(pixels, total.shape)
+    if not per_channel:
+        count = count * values.shape[-1]
+    return divide(total, count, where=count > 0, otherwise=otherwise)
+
+
+def safe_sqrt(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return the square root, with 0 and a derivative of 0 where it is not positive.
+
+    Args:
+        square: any shape and unit; NaN stays NaN.
+
+    Returns:
+        the root, same shape.
+
+    Example:
+        >>> print(safe_sqrt(jnp.array([4.0, 0.0])), jax.grad(safe_sqrt)(0.0))
+        [2. 0.] 0.0
+    """
+    none = square <= 0
+    return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square)))

@@ -1,9 +1,13 @@
-"""Means over windows with weights of each pixel's own, given or predicted.
+"""Means over windows where every pixel has its own kernel, given or predicted.
 
-Such weights have no separable form. A network's are many: 225 a pixel for windows of 15
-take 0.9 GB a megapixel, so `predicted_mean` makes and uses them a strip of rows at a
+Such weights have no separable form. A network predicts many: 225 a pixel for windows of
+15 take 0.9 GB a megapixel, so `predicted_mean` makes and uses them a strip of rows at a
 time. The sums walk the window row by row, so that neither the value nor the reverse
-derivative ever holds its w² shifted copies of the image.
+derivative ever holds w² shifted copies of the image.
+
+Layout: images [H,W,C] of any unit, which is that of the means; kernels [H,W,w²], at
+least zero, row-major over the offsets (-r, -r) ... (r, r) with r = w // 2. Weights
+outside the image do not count. Windows and `mask` as in `windows`.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,18 +18,20 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import divide
+from jscomb.numerics.guards import weighted_ratio
 from jscomb.numerics.tiles import map_rows
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Mask
 
+__all__ = ["Kernels", "kernel_mean", "predicted_mean"]
+
 
 class Kernels(NamedTuple):
-    """Weights of every pixel's window, to be worked out a strip of rows at a time.
+    """Kernels of all pixels, to be evaluated a strip of rows at a time.
 
     Attributes:
-        features: what they are made of, shape [H,W,F].
-        head: from a strip of them, [t+2*reach,W,F], to weights, at least zero, [t,W,K].
+        features: input of the head, shape [H,W,F].
+        head: from a strip of features, [t+2*reach,W,F], to weights [t,W,K].
         reach: rows around a strip that its weights depend on.
     """
 
@@ -41,22 +47,19 @@ def kernel_mean(
     *,
     mask: Mask | None = None,
 ) -> Image:
-    """Mean over the window of each pixel with weights of its own.
+    """Average over the window of each pixel with its own weights.
 
     Args:
-        image: values of any unit, shape [H,W,C].
-        weights: at least zero, shape [H,W,w²], row-major over the offsets
-            (-r, -r) ... (r, r); those that fall outside the image do not count.
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        image: shape [H,W,C].
+        weights: kernels, shape [H,W,w²].
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the means, in the unit of `image`, shape [H,W,C]; 0 where the weights of all
-        pixels that take part are 0.
+        the means, shape [H,W,C]; 0 where all included pixels have weight 0.
 
     Raises:
-        ValueError: if `window` is even or less than one, or the weights' shape is not
-            [H,W,w²].
+        ValueError: if `window` is even or below one, or the weights do not fit.
 
     Example:
         >>> left = jnp.zeros((1, 3, 9)).at[..., 3].set(1.0)
@@ -72,7 +75,7 @@ def kernel_mean(
             f"got {weights.shape}"
         )
     padded = jnp.pad(_counted([image], mask), ((r, r), (r, r), (0, 0)))
-    return _mean(_taps(padded, weights, window))
+    return _mean(_weighted_sum(padded, weights, window))
 
 
 def predicted_mean(
@@ -82,23 +85,19 @@ def predicted_mean(
     *,
     mask: Mask | None = None,
 ) -> Float[Array, "n h w c"]:
-    """Means over the window of each pixel with weights that a network predicts.
-
-    The weights of a strip of rows exist while it is worked on, never those of all
-    pixels.
+    """Average over the window of each pixel with weights that a network predicts.
 
     Args:
-        images: values of any unit, each with kernels of its own, shape [N,H,W,C].
-        kernels: N w² weights a pixel, as for `kernel_mean`, one image after another.
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        images: each with its own kernels, shape [N,H,W,C].
+        kernels: N w² weights a pixel, one image after another.
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the means, shape [N,H,W,C]; 0 where the weights of all pixels that take part
-        are 0.
+        the means, shape [N,H,W,C]; 0 where all included pixels have weight 0.
 
     Raises:
-        ValueError: if `window` is even or less than one, or there are not N w² weights.
+        ValueError: if `window` is even or below one, or there are not N w² weights.
 
     Example:
         >>> image = jnp.array([1.0, 2.0, 6.0]).reshape(1, 3, 1)
@@ -109,61 +108,58 @@ def predicted_mean(
     """
     n, _, _, c = images.shape
     r = check_window(window) // 2
-    both = jnp.pad(_counted(images, mask), ((0, 0), (r, r), (0, 0)))
+    padded = jnp.pad(_counted(images, mask), ((0, 0), (r, r), (0, 0)))
 
     def strip(features: Array, near: Array) -> Array:
-        """The means of all images side by side."""
+        """Return the means of all images side by side."""
         weights = kernels.head(features)
         if weights.shape[-1] != n * window**2:
             raise ValueError(
                 f"{n} images and windows of {window} need {n * window**2} weights a "
                 f"pixel, got {weights.shape[-1]}"
             )
-        # An image's channels and the mask.
-        own = [jnp.r_[k * c : (k + 1) * c, n * c] for k in range(n)]
-        shares = jnp.split(weights, n, axis=-1)
-        pairs = zip(own, shares, strict=True)
-        sums = [_taps(near[..., i], share, window) for i, share in pairs]
-        return jnp.concatenate([_mean(s) for s in sums], axis=-1)
+        means = []
+        for k, kernel in enumerate(jnp.split(weights, n, axis=-1)):
+            channels = jnp.r_[k * c : (k + 1) * c, n * c]  # an image and the mask
+            means.append(_mean(_weighted_sum(near[..., channels], kernel, window)))
+        return jnp.concatenate(means, axis=-1)
 
-    mean = map_rows(strip, [(kernels.features, kernels.reach), (both, r)])
+    mean = map_rows(strip, [(kernels.features, kernels.reach), (padded, r)])
     return jnp.stack(jnp.split(mean, n, axis=-1))
 
 
 def _counted(images: Iterable[Image], mask: Mask | None) -> Array:
-    """Images side by side, 0 where a pixel takes no part, and 1 where it does."""
+    """Return images side by side, then the mask as numbers; 0 where excluded."""
     images = list(images)
     ones = jnp.ones_like(images[0][..., :1])
     if mask is None:
         return jnp.concatenate([*images, ones], axis=-1)
-    some = [jnp.where(mask, image, 0.0) for image in images]
-    return jnp.concatenate([*some, mask.astype(ones.dtype)], axis=-1)
+    included = [jnp.where(mask, image, 0.0) for image in images]
+    return jnp.concatenate([*included, mask.astype(ones.dtype)], axis=-1)
 
 
-def _taps(
+def _weighted_sum(
     padded: Float[Array, "_ _ c"], weights: Float[Array, "h w _"], window: int
 ) -> Image:
-    """Weighted sums of values with w // 2 more pixels on every side, [H,W,C]."""
+    """Sum over windows of an image that has w // 2 more pixels on every side."""
     h, w, _ = weights.shape
     rows = jnp.moveaxis(weights.reshape(h, w, window, window), 2, 0)
 
     @jax.checkpoint
     def add_row(total: Image, row: tuple[Array, Array]) -> tuple[Image, None]:
-        number, share = row
+        number, weight = row
         strip = lax.dynamic_slice_in_dim(padded, number, h, axis=0)
         for column in range(window):
             near = lax.slice_in_dim(strip, column, column + w, axis=1)
-            total = total + share[..., column : column + 1] * near
+            total = total + weight[..., column : column + 1] * near
         return total, None
 
     start = jnp.zeros((h, w, padded.shape[-1]), padded.dtype)
-    # Rows of weights as what is scanned over: sliced from all of them inside the loop,
-    # each turn's derivative would be added to an array of all.
+    # Scan over the rows of weights: were they sliced inside the loop, every step would
+    # add its derivative to an array of all weights.
     return lax.scan(add_row, start, (jnp.arange(window), rows))[0]
 
 
 def _mean(sums: Float[Array, "h w _"]) -> Float[Array, "h w _"]:
-    """Sums, the last of which is that of the weights, as means."""
-    total, weight = sums[..., :-1], sums[..., -1:]
-    weight = jnp.broadcast_to(weight, total.shape)
-    return divide(total, weight, where=weight > 0)
+    """Divide sums by the last of them, that of the weights."""
+    return weighted_ratio(sums[..., :-1], sums[..., -1:])

@@ -1,12 +1,12 @@
 r"""Windowed weighted least squares about every pixel, as matrix products.
 
 In the window of each centre c a linear model of the features is fitted to the target;
-every pixel then takes the weighted mean of what all windows that contain it predict.
+a pixel's result is the weighted mean of the predictions of all windows that contain it.
 Layout: images [H,W,*]. Notation:
 
     t    target, [H,W,C], any unit
-    g    guide, [H,W,G], which tells what pixels are alike
-    f    features, [H,W,F], what the model is linear in
+    g    guide, [H,W,G], which decides what pixels are alike
+    f    features, [H,W,F], which the model is linear in
     h    bandwidth, unit of g squared
     w    weights, w_ci = exp(-|g_i - g_c|^2 / h) for i in the window of c, else 0
     s    scale of each feature in a window, s_c = max_i |f_i - f_c| + scale_floor
@@ -15,8 +15,8 @@ Layout: images [H,W,*]. Notation:
     a_c, b_c = argmin sum_i w_ci (t_i - a - b.d_i)^2 + ridge |b|^2
     t^_i     = sum_c w_ci (a_c + b_c.d_i) / sum_c w_ci
 
-The constant has no ridge, which would darken isolated bright pixels. So it leaves the
-problem, and what is solved has only the features:
+The constant has no ridge, which would darken isolated bright pixels. So it can be
+eliminated, and the unknowns are only the slopes:
 
     (C_w(d, d) + ridge) b = C_w(d, t),    a + b.d_i = mean_w(t) + b.(d_i - mean_w(d)),
 
@@ -24,15 +24,14 @@ with C_w(p, q) = sum_i w_ci (p_i - mean_w(p)) (q_i - mean_w(q)).
 
 Fast, because the M centres of a tile (see `tiles`) share a neighbourhood of N pixels.
 With W [M,N] their weights and Phi the products of features and targets, [moments,N],
-Phi W' holds all moments of all windows; with B [.., M] the coefficients, B W holds all
-predictions. Features are taken from those of one pixel in the tile's middle, which lies
-in all of its windows, so no moment is large beside the square of s, and float32
-suffices.
+Phi W' holds all moments of all windows; with B [..., M] the coefficients, B W holds all
+predictions. Features are relative to one pixel in the tile's middle, which lies in all
+of its windows, so no moment is large compared to s^2, and float32 suffices.
 
 Sources:
     B. Moon, N. Carr, S.-E. Yoon, "Adaptive rendering based on weighted local
     regression", 2014, for the model; NJS eq. 10-12 and DSC eq. 11-17 for the weights
-    and for the predictions' mean. The tiles and the closed form are ours.
+    and the mean of the predictions. The tiles and the closed form are ours.
 """
 
 from collections.abc import Sequence
@@ -45,25 +44,26 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics import cholesky
-from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.guards import check_same_shape, weighted_ratio, zero_invalid
 from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
 from jscomb.numerics.weights import Weights, gaussian_weights, tile_weights
 from jscomb.numerics.windows import check_window, window_max, window_min
 from jscomb.typing import Image, Mask, Scalar
 
-# Measured best on a CPU: a side of 16 centres or 32 pixels, and weights that just stay
-# in the cache.
+__all__ = ["LocalFit", "joint_local_linear", "local_linear"]
+
+# Fastest on a CPU: a side of 16 centres or 32 pixels, and weights that just fit the
+# cache.
 _SIDE, _STEP, _CENTRES = 16, 32, 512
 
 
 class LocalFit(NamedTuple):
-    """What the windows predict.
+    """Mean of the windows' predictions.
 
     Attributes:
         prediction: t^, unit of the target, [H,W,C]; 0 where `weight` is 0.
-        weight: sum_c w_ci, how much of all windows speaks for a pixel, [H,W,1]. At a
-            valid pixel at least 1 for a stride of 1, but for larger strides as little
-            as 0; at an invalid pixel 0.
+        weight: sum_c w_ci, [H,W,1]. At a valid pixel at least 1 for a stride of 1, but
+            possibly 0 for larger strides; at an invalid pixel 0.
     """
 
     prediction: Image
@@ -83,35 +83,30 @@ def local_linear(
 ) -> LocalFit:
     """Fit a linear model of the features in every window; average the predictions.
 
-    Pure, and differentiable in every array. With eleven features it executes about 500
-    operations for each pixel of each window. Strides of 2, 4 and 8 are 2.6, 5 and 9
-    times as fast (51x51, two cores). Memory does not depend on the window.
+    With eleven features it executes about 500 operations for each pixel of each window.
+    Strides of 2, 4 and 8 are 2.6, 5 and 9 times as fast (51x51, two cores). Memory does
+    not depend on the window. Pixels that are not finite in some input are excluded.
 
     Args:
         target: t, any unit, shape [H,W,C].
         guide: g, shape [H,W,G].
         features: f, shape [H,W,F]; F may be 0.
         bandwidth: h > 0, unit of the guide squared: one number, or shape [H,W,1] for
-            the mean of both pixels' values. Where it is not positive the pixel is
-            invalid.
-        window: width of the windows in pixels, odd.
+            the mean of both pixels' values. Where h is not positive pixels are invalid.
+        window: width in pixels, odd.
         stride: pixels between the centres of windows, along both axes; at most half the
             window. Above 1 a pixel at the border may lie in no window.
-        ridge: > 0, added to the diagonal for each scaled feature: one number or one a
-            feature, shape [F].
-        scale_floor: > 0, unit of the features; one that varies less than this is held
-            for noise.
+        ridge: > 0, of the scaled features: one number, or one a feature, shape [F].
+        scale_floor: > 0, unit of the features; smaller variation counts as noise.
 
     Returns:
-        the predictions and their weights. Pixels that are not finite in some input take
-        no part, and have weight 0.
+        the predictions and their weights.
 
     Raises:
         ValueError: while tracing, if sizes differ, `window` is even, `stride` does not
             fit, or a number that must be positive is not.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> depth = jnp.arange(12.0).reshape(3, 4, 1)
         >>> fit = local_linear(3 * depth, depth, depth, 100.0, window=3, ridge=1e-6)
         >>> print(jnp.abs(fit.prediction - 3 * depth).max().round(3))
@@ -140,19 +135,18 @@ def joint_local_linear(
     ridge: Float[Array, " f"] | float = 0.1,
     scale_floor: float = 0.1,
 ) -> LocalFit:
-    """Fit one linear model to several targets, each with weights of its own.
+    """Fit one linear model to several targets, each with its own weights.
 
-    Minimises the sum of their squared errors, which is the sum of their normal
-    equations.
+    Minimises the sum of their squared errors, whose normal equations are the sum of
+    theirs.
 
     Args:
         targets: images [H,W,C] of one unit, with their weights.
         features: f, shape [H,W,F].
-        predict: weights for the mean of the predictions; None for those of the first
-            target.
-        window: width of the windows in pixels, odd.
+        predict: weights for the mean of the predictions; None for the first target's.
+        window: width in pixels, odd.
         stride: pixels between the centres of windows.
-        ridge: > 0, one number or one a feature, shape [F].
+        ridge: > 0, of the scaled features: one number, or one a feature, shape [F].
         scale_floor: > 0, unit of the features.
 
     Returns:
@@ -172,31 +166,31 @@ def joint_local_linear(
     Source: DSC eq. 11-15.
     """
     grid = _grid(window, stride)
-    kernels = [weights for _, weights in targets]
-    kernels += [] if predict is None else [predict]
-    _check(targets, features, kernels, ridge, scale_floor)
-    images = [features, *(image for image, _ in targets), *(k.image for k in kernels)]
-    valid = finite(*images)
+    similarity = [weights for _, weights in targets]
+    similarity += [] if predict is None else [predict]
+    _check(targets, features, similarity, ridge, scale_floor)
+    count = len(targets)
+    valid, clean, *images = zero_invalid(
+        features, *(image for image, _ in targets), *(s.image for s in similarity)
+    )
     ridges = jnp.broadcast_to(jnp.asarray(ridge, features.dtype), features.shape[2:])
     inside = grid.inside
 
-    def region(image: Image, reach: int) -> Region:
-        return Region(jnp.moveaxis(jnp.where(valid, image, 0.0), -1, 0), reach)
-
     def fit(basis: Planes, scale: Planes, *planes: Planes) -> Planes:
-        """The sums over a tile's windows of weighted predictions, and of weights."""
+        """Sum weighted predictions, and weights, over a tile's windows."""
         size = basis.shape[1:]
         basis, centred = _centred(basis, grid)
         scale = jnp.where(centred[None], grid.centres(scale), 1.0)
         weights = [
-            jnp.where(inside, tile_weights(kernel, plane, grid), 0.0)
-            for kernel, plane in zip(kernels, planes[len(targets) :], strict=True)
+            jnp.where(inside, tile_weights(s, plane, grid), 0.0)
+            for s, plane in zip(similarity, planes[count:], strict=True)
         ]
         moments = [
             jnp.einsum("pn,mn->pm", _products(basis, flat(t)), w, precision="highest")
-            for t, w in zip(planes[: len(targets)], weights, strict=False)
+            for t, w in zip(planes[:count], weights, strict=False)
         ]
-        # Without a moment a centre predicts 0, and nothing differentiates its rounding.
+        # An invalid centre without moments predicts 0, and its rounding has no
+        # derivative.
         moment = jnp.where(centred[None], sum(moments[1:], moments[0]), 0.0)
         b = _coefficients(moment, scale, ridges)
         b = jnp.concatenate([b, centred[None].astype(b.dtype)])
@@ -206,26 +200,28 @@ def joint_local_linear(
         predicted = sum(term * f[None] for term, f in zip(terms, basis, strict=True))
         return jnp.concatenate([predicted, spread[-1:]]).reshape(-1, *size)
 
-    near = grid.reach
-    clean = jnp.where(valid, features, 0.0)
+    region = lambda image, reach: Region(jnp.moveaxis(image, -1, 0), reach)
+    basis = jnp.concatenate([valid.astype(clean.dtype), clean], -1)
+    scale = jnp.where(valid, _scale(clean, valid, window) + scale_floor, 0.0)
+    halos = [0] * count + [s.halo for s in similarity]
     regions = [
-        region(jnp.concatenate([valid.astype(clean.dtype), clean], -1), near),
-        region(_scale(clean, valid, window) + scale_floor, 0),
-        *(region(image, near) for image, _ in targets),
-        *(region(kernel.image, near + kernel.halo) for kernel in kernels),
+        region(basis, grid.reach),
+        region(scale, 0),
+        *(region(i, grid.reach + h) for i, h in zip(images, halos, strict=True)),
     ]
     sums = jnp.moveaxis(sum_over_tiles(fit, regions, grid), 0, -1)
-    total, weight = sums[..., :-1], jnp.where(valid, sums[..., -1:], 0.0)
-    least = float(jnp.finfo(weight.dtype).tiny)
-    spoken = jnp.broadcast_to(weight, total.shape)
-    return LocalFit(divide(total, spoken, where=spoken > least), weight)
+    total, weight = sums[..., :-1], sums[..., -1:]
+    # A subnormal weight has lost digits, and is 0 on some devices.
+    normal = valid & (weight > float(jnp.finfo(weight.dtype).tiny))
+    weight = jnp.where(normal, weight, 0.0)
+    return LocalFit(weighted_ratio(total, weight), weight)
 
 
 def _centred(basis: Planes, grid: Grid) -> tuple[Float[Array, "p n"], Array]:
-    """1 and features from a common origin, 0 at invalid pixels; the valid centres.
+    """Return 1 and features relative to an origin, 0 at invalid pixels; valid centres.
 
-    The origin is the valid centre next to the tile's middle. It changes no result but
-    the rounding.
+    The origin is the valid centre nearest to the tile's middle. It affects only the
+    rounding.
     """
     centres = grid.centres(basis)
     valid = centres[0] > 0
@@ -240,7 +236,7 @@ def _centred(basis: Planes, grid: Grid) -> tuple[Float[Array, "p n"], Array]:
 def _products(
     basis: Float[Array, "p n"], target: Float[Array, "c n"]
 ) -> Float[Array, "_ n"]:
-    """Phi: products of the basis with itself, upper triangle, and with the target."""
+    """Return Phi: products of the basis with itself (upper triangle) and the target."""
     rows = [basis[k : k + 1] * basis[k:] for k in range(len(basis))]
     return jnp.concatenate([*rows, *(f * target for f in basis[:, None])])
 
@@ -250,7 +246,7 @@ def _coefficients(
     scale: Float[Array, "f m"],
     ridges: Float[Array, " f"],
 ) -> Float[Array, "_ m"]:
-    """Constant and slopes of all windows, for the basis, [P*C,M]."""
+    """Return the constant and the slopes of all windows, for the basis, [P*C,M]."""
     p, m = len(scale) + 1, moments.shape[1]
     square = np.zeros((p, p), int)
     square[np.triu_indices(p)] = np.arange(p * (p + 1) // 2)
@@ -258,42 +254,44 @@ def _coefficients(
     ff = moments[square]  # sum w f f', [P,P,M]
     ft = moments[p * (p + 1) // 2 :].reshape(p, -1, m)  # sum w f t, [P,C,M]
     total = ff[0, 0]
-    per_weight = divide(jnp.ones_like(total), total, where=total > 0)
+    per_weight = weighted_ratio(jnp.ones_like(total), total)
     mean_f, mean_t = ff[0, 1:] * per_weight[None], ft[0] * per_weight[None]
     spread = ff[1:, 1:] - ff[0, 1:, None] * mean_f[None]
     spread = spread / (scale[:, None] * scale[None])
     ridge = (ridges[None] * jnp.eye(p - 1, dtype=ridges.dtype))[..., None]
-    shared = (ft[1:] - ff[0, 1:, None] * mean_t[None]) / scale[:, None]
-    slopes = cholesky.solve(spread + ridge, shared, ridges[:, None]) / scale[:, None]
+    joint = (ft[1:] - ff[0, 1:, None] * mean_t[None]) / scale[:, None]
+    slopes = cholesky.solve(spread + ridge, joint, ridges[:, None]) / scale[:, None]
     constant = mean_t - jnp.sum(slopes * mean_f[:, None], axis=0)
     return jnp.concatenate([constant, slopes.reshape(-1, m)])
 
 
 def _scale(features: Image, valid: Mask, window: int) -> Image:
-    """max_i |f_i - f_c| over each window; at an invalid centre of no meaning.
+    """Return max_i |f_i - f_c| over each window, 0 at an invalid centre.
 
-    One feature after the other: all at once would be the largest memory of the fit.
+    One feature after another: all at once would dominate the memory of the fit.
     """
 
     def one(plane: Float[Array, "h w"]) -> Float[Array, "h w"]:
         f = plane[..., None]
-        most = window_max(f, window, mask=valid) - f
-        least = f - window_min(f, window, mask=valid)
-        return jnp.where(valid, jnp.maximum(most, least), 0.0)[..., 0]
+        above = window_max(f, window, mask=valid) - f
+        below = f - window_min(f, window, mask=valid)
+        return jnp.where(valid, jnp.maximum(above, below), 0.0)[..., 0]
 
     planes = lax.map(jax.checkpoint(one), jnp.moveaxis(features, -1, 0))
     return jnp.moveaxis(planes, 0, -1)
 
 
 def _grid(window: int, stride: int) -> Grid:
-    """Tiles of which the middle lies in all windows.
+    """Return tiles whose middle lies in all of their windows.
 
-    With a quarter of the reach to spare, for when the pixel in the middle is invalid.
+    A quarter of the reach is spare, for when the pixel in the middle is invalid.
     """
     reach = check_window(window) // 2
-    most = reach + 1
-    if not 1 <= stride <= most:
-        raise ValueError(f"stride must be from 1 to {most} for {window=}, got {stride}")
+    maximum = reach + 1
+    if not 1 <= stride <= maximum:
+        raise ValueError(
+            f"stride must be from 1 to {maximum} for {window=}, got {stride}"
+        )
     side = max(1, min(_SIDE, _STEP // stride))
     while (grid := Grid(side, stride, reach, max(1, _CENTRES // side**2))).side > 1:
         if np.ptp(grid.places, axis=1).max() <= 1.5 * reach:
@@ -305,14 +303,14 @@ def _grid(window: int, stride: int) -> Grid:
 def _check(
     targets: Sequence[tuple[Image, Weights]],
     features: Array,
-    kernels: Sequence[Weights],
+    similarity: Sequence[Weights],
     ridge: Array | float,
     scale_floor: float,
 ) -> None:
     """Raise unless sizes agree and numbers are positive."""
     target = targets[0][0]
     check_same_shape(**{f"target {k}": image for k, (image, _) in enumerate(targets)})
-    others = [("features", features), *(("guide", kernel.image) for kernel in kernels)]
+    others = [("features", features), *(("guide", s.image) for s in similarity)]
     for name, image in others:
         if image.ndim != 3 or image.shape[:2] != target.shape[:2]:
             raise ValueError(

@@ -1,20 +1,19 @@
-r"""Stein's unbiased risk estimate: a denoised image's squared error, without truth.
+r"""Stein's unbiased risk estimate: squared error of a denoised image, without truth.
 
 Layout: images [H,W,C], linear radiance. Notation, for each element i of an image:
 
     x    noisy, unbiased image; truth mu; x ~ N(mu, v), elements independent
-    v    variance of the mean x
+    v    variance of x (of the mean)
     F    denoiser, any function of an image; J its Jacobian at x
     b    probe, independent elements of mean 0 and variance v
 
     E[(F(x) - mu)_i^2] = E[(F(x) - x)_i^2 + 2 J_ii v_i - v_i]                  (SURE)
     J_ii v_i = E[b_i (J b)_i]                                           (Monte Carlo)
 
-J b is one forward derivative: exact, whatever the scale of x, where a difference
-quotient of float32 images has lost its digits on bright pixels or its slope on dark
-ones. One element's estimate is hardly more than noise and often negative: average over
-windows or frames. What the noise's tails and correlations do to the truth of it, the
-formula does not know.
+J b is one forward derivative, exact at any scale of x; a difference quotient of float32
+images loses its digits on bright pixels or its slope on dark ones. The estimate of one
+element is mostly noise and often negative: average it over windows or frames. Noise
+with heavy tails or correlated between pixels violates the assumption and biases it.
 
 Sources:
     C. Stein, "Estimation of the mean of a multivariate normal distribution", 1981.
@@ -31,20 +30,28 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jscomb.numerics.guards import check_not_negative, check_same_shape, finite
+from jscomb.numerics.guards import (
+    check_not_negative,
+    check_same_shape,
+    finite,
+    safe_sqrt,
+    zero_invalid,
+)
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Key, Variance
+
+__all__ = ["Risk", "exact_sure", "monte_carlo_sure", "pooled"]
 
 Probe = Literal["rademacher", "gaussian"]
 
 
 class Risk(NamedTuple):
-    """A denoised image and what is known of its error, [H,W,C] each.
+    """A denoised image and its estimated error, [H,W,C] each.
 
     Attributes:
         denoised: F(x), linear radiance.
-        squared_error: estimate of (F(x) - mu)^2 at each element, squared radiance;
-            unbiased, noisy, of either sign; 0 at invalid pixels.
+        squared_error: estimate of (F(x) - mu)^2, squared radiance; unbiased, noisy, of
+            either sign; 0 at invalid pixels.
         divergence: estimate of J_ii v_i, squared radiance; 0 at invalid pixels.
     """
 
@@ -64,19 +71,19 @@ def monte_carlo_sure(
 ) -> Risk:
     """Denoise, and estimate the squared error of every element of the result.
 
-    One forward derivative a probe, one probe at a time: neither time but that of
-    denoising nor memory but that of a probe. Scale-equivariant if the denoiser is.
+    Takes one forward derivative of the denoiser for each probe, one after the other.
+    Scale-equivariant if the denoiser is.
 
     Args:
-        key: of the probes, a typed key.
+        key: a typed key, for the probes.
         denoise: F, from an image to one of the same shape; with forward derivatives.
-            Features that guide it count as fixed.
+            Features that guide it are treated as constants.
         noisy: x, linear radiance, shape [H,W,C].
-        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
-        probes: how many to average over; the divergence's own noise falls with them,
-            that of (F(x) - x)^2 does not.
-        probe: signs ("rademacher": exact with a single probe where each output depends
-            on its own pixel alone, and the better one in general), or "gaussian".
+        variance: v, squared radiance, at least zero, shape [H,W,C].
+        probes: number to average over; reduces the noise of the divergence, not that
+            of (F(x) - x)^2.
+        probe: random signs, "rademacher" (usually better, and exact with one probe
+            where each output depends on its own pixel alone), or "gaussian".
 
     Returns:
         the denoised image, its estimated squared error, and the divergence. Pixels that
@@ -84,8 +91,8 @@ def monte_carlo_sure(
 
     Raises:
         ValueError: while tracing, if shapes differ, the denoiser changes the shape,
-            `probes` is not positive or the probe is not known; and if the variance is
-            negative, where its values are known.
+            `probes` is not positive or the probe unknown; outside of `jit` also if the
+            variance is negative.
 
     Example:
         >>> x = jnp.full((4, 4, 1), 3.0)
@@ -104,7 +111,7 @@ def monte_carlo_sure(
     draw = jax.random.rademacher if probe == "rademacher" else jax.random.normal
 
     def one(key: Array) -> tuple[Image, Image]:
-        """F(x), and what a single probe says of the divergence."""
+        """F(x), and the divergence estimated by one probe."""
         b = deviation * draw(key, noisy.shape, noisy.dtype)
         denoised, moved = jax.jvp(denoise, (noisy,), (b,))
         _check_denoised(denoised, noisy)
@@ -121,9 +128,9 @@ def monte_carlo_sure(
 def exact_sure(
     denoise: Callable[[Image], Image], noisy: Image, variance: Variance
 ) -> Risk:
-    """The same with the exact divergence: a derivative for every element.
+    """Return the risk with the exact divergence, to check small images.
 
-    For checking on small images.
+    Takes one derivative for every element.
 
     Args:
         denoise: F, from an image to one of the same shape; with forward derivatives.
@@ -131,10 +138,11 @@ def exact_sure(
         variance: v, squared radiance, shape [H,W,C].
 
     Returns:
-        as `monte_carlo_sure`.
+        the same as `monte_carlo_sure`.
 
     Raises:
-        ValueError: as `monte_carlo_sure`.
+        ValueError: while tracing, if shapes differ or the denoiser changes the shape;
+            outside of `jit` also if the variance is negative.
 
     Example:
         >>> x = jnp.full((2, 2, 1), 3.0)
@@ -157,16 +165,16 @@ def exact_sure(
 
 
 def pooled(risk: Risk, noisy: Image, variance: Variance, *, window: int) -> Risk:
-    """Means over windows of the estimates, which is what makes them usable.
+    """Average the estimates over windows.
 
     Args:
-        risk: of `monte_carlo_sure`.
-        noisy: x that it was made from, shape [H,W,C].
-        variance: v likewise.
+        risk: from `monte_carlo_sure`.
+        noisy: x, linear radiance, shape [H,W,C].
+        variance: v, squared radiance, shape [H,W,C].
         window: width of the windows in pixels, odd.
 
     Returns:
-        the same with `squared_error` and `divergence` averaged over the valid pixels of
+        the risk with `squared_error` and `divergence` averaged over the valid pixels of
         each window.
 
     Raises:
@@ -186,26 +194,24 @@ def pooled(risk: Risk, noisy: Image, variance: Variance, *, window: int) -> Risk
 
 
 def _deviation(noisy: Image, variance: Variance) -> Image:
-    """Standard deviation of valid pixels, else 0; with a derivative at 0, of 0."""
+    """Standard deviation of valid pixels, else 0."""
     check_same_shape(noisy=noisy, variance=variance)
     check_not_negative(variance=variance)
-    some = finite(noisy, variance) & (variance > 0)
-    return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1.0)), 0.0)
+    _, _, variance = zero_invalid(noisy, variance)
+    return safe_sqrt(variance)
 
 
 def _risk(noisy: Image, variance: Variance, denoised: Image, divergence: Image) -> Risk:
     """SURE of every element."""
-    valid = finite(noisy, variance, denoised)
-    x, v, y, d = (
-        jnp.where(valid, i, 0.0) for i in (noisy, variance, denoised, divergence)
-    )
+    valid, x, v, y = zero_invalid(noisy, variance, denoised)
+    d = jnp.where(valid, divergence, 0.0)
     return Risk(denoised, jnp.square(y - x) + 2 * d - v, d)
 
 
 def _check_denoised(denoised: Array, noisy: Image) -> None:
-    """Raise unless the denoiser kept the shape."""
+    """Raise if the denoiser changed the shape."""
     if denoised.shape != noisy.shape:
         raise ValueError(
-            f"denoise made {denoised.shape} of an image of {noisy.shape}: it must keep "
-            "the shape"
+            f"denoise made {denoised.shape} of an image of {noisy.shape}: the shapes "
+            "must be equal"
         )

@@ -1,24 +1,20 @@
 """Sums, means and extrema over square windows that are clipped to the image.
 
-The window of pixel c is the w-by-w square about c, cut off at the border: never
-reflected, never wrapped, because a reflected pixel is not a new sample. So the count
-p_c of its pixels varies, and any image of at least 1x1 works, also one smaller than the
-window.
+The window of a pixel is the w-by-w square about it, w odd, cut off at the border: never
+reflected, never wrapped, because a reflected pixel is not a new sample. So the count of
+its pixels varies, and any image of at least 1x1 works, also one smaller than the
+window. Layout: images [H,W,C] of any unit, which is that of the result. A `mask`
+[H,W,1] selects pixels, None all; the others are excluded, and may be NaN.
 
-Sums are made of additions of the window's own pixels, separably where all windows have
-the same weights. Running differences (integral images) are never used: one firefly of
-1e6 would erase the float32 digits of every later pixel in its row. Columns are slid by
-doubling (sums over 1, 2, 4, ... pixels, put together by the bits of w), the fastest
-form on a CPU; rows by
-`lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
+Sums add the window's own pixels, separably where all windows have the same weights.
+Running differences (integral images) are never used: one firefly of 1e6 would erase the
+float32 digits of every later pixel in its row. Columns are summed by doubling (over 1,
+2, 4, ... pixels, combined by the bits of w), the fastest form on a CPU. Rows are summed
+by `lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
 (two collective permutes, where doubling needs twelve); for wide windows twice, which
-takes less work. Extrema double along both axes:
-`reduce_window` is many times slower on a CPU. Gaussian weights have no such form, nor
-have those of `kernels`, which differ from pixel to pixel: sharded by rows they exchange
-pixels once for every row of the window.
-
-A `mask` names the pixels that take part; what the others hold is never looked at, so it
-may be NaN.
+costs less. Extrema double along both axes: `reduce_window` is many times slower on a
+CPU. Gaussian weights have no such form, nor have those of `kernels`, which differ from
+pixel to pixel: sharded by rows they exchange pixels once for every row of the window.
 """
 
 import math
@@ -29,28 +25,39 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from jscomb.numerics.guards import divide
+from jscomb.numerics.guards import weighted_ratio
 from jscomb.typing import Image, Mask
 
-_FEW = 15  # rows that are added in one step
+__all__ = [
+    "at_window_max",
+    "check_window",
+    "reach_of",
+    "separable_sum",
+    "window_count",
+    "window_max",
+    "window_mean",
+    "window_min",
+    "window_sum",
+]
+
+_FEW = 15  # rows to add in one step
 
 
 def window_sum(image: Image, window: int, *, mask: Mask | None = None) -> Image:
     """Sum over the window of each pixel.
 
     Args:
-        image: values of any unit, shape [H,W,C].
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        image: shape [H,W,C].
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the sums, in the unit of `image`, shape [H,W,C].
+        the sums, shape [H,W,C].
 
     Raises:
-        ValueError: if `window` is even or less than one.
+        ValueError: if `window` is even or below one.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> print(window_sum(jnp.ones((2, 3, 1)), 3)[..., 0])
         [[4. 6. 4.]
          [4. 6. 4.]]
@@ -63,23 +70,21 @@ def window_sum(image: Image, window: int, *, mask: Mask | None = None) -> Image:
 def window_mean(
     image: Image, window: int, *, mask: Mask | None = None, sigma: float | None = None
 ) -> Image:
-    """Mean over the window of each pixel, equal or Gaussian weights.
+    """Average over the window of each pixel, with equal or Gaussian weights.
 
     Args:
-        image: values of any unit, shape [H,W,C].
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        image: shape [H,W,C].
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
         sigma: standard deviation in pixels of Gaussian weights; None for equal ones.
 
     Returns:
-        the means, in the unit of `image`, shape [H,W,C]; 0 where no pixel of the
-        window takes part.
+        the means, shape [H,W,C]; 0 where the window includes no pixel.
 
     Raises:
-        ValueError: if `window` is even or less than one, or `sigma` is not positive.
+        ValueError: if `window` is even or below one, or `sigma` is not positive.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> print(window_mean(jnp.arange(3.0).reshape(1, 3, 1), 3)[..., 0])
         [[0.5 1.  1.5]]
     """
@@ -89,26 +94,24 @@ def window_mean(
     else:
         kernel = _gaussian(window, sigma)
         total, weight = (separable_sum(i, kernel) for i in (image, ones))
-    weight = jnp.broadcast_to(weight, total.shape)
-    return divide(total, weight, where=weight > 0)
+    return weighted_ratio(total, weight)
 
 
 def window_min(image: Image, window: int, *, mask: Mask | None = None) -> Image:
-    """Least value in the window of each pixel.
+    """Return the minimum over the window of each pixel.
 
     Args:
-        image: values of any unit, shape [H,W,C].
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        image: shape [H,W,C].
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the minima, shape [H,W,C]; infinite where no pixel of the window takes part.
+        the minima, shape [H,W,C]; infinite where the window includes no pixel.
 
     Raises:
-        ValueError: if `window` is even or less than one.
+        ValueError: if `window` is even or below one.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> print(window_min(jnp.arange(4.0).reshape(1, 4, 1), 3)[..., 0])
         [[0. 0. 1. 2.]]
     """
@@ -116,22 +119,20 @@ def window_min(image: Image, window: int, *, mask: Mask | None = None) -> Image:
 
 
 def window_max(image: Image, window: int, *, mask: Mask | None = None) -> Image:
-    """Greatest value in the window of each pixel.
+    """Return the maximum over the window of each pixel.
 
     Args:
-        image: values of any unit, shape [H,W,C].
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        image: shape [H,W,C].
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the maxima, shape [H,W,C]; minus infinity where no pixel of the window takes
-        part.
+        the maxima, shape [H,W,C]; minus infinity where the window includes no pixel.
 
     Raises:
-        ValueError: if `window` is even or less than one.
+        ValueError: if `window` is even or below one.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> print(window_max(jnp.arange(4.0).reshape(1, 4, 1), 3)[..., 0])
         [[1. 2. 3. 3.]]
     """
@@ -141,23 +142,22 @@ def window_max(image: Image, window: int, *, mask: Mask | None = None) -> Image:
 def at_window_max(
     by: Float[Array, "h w 1"], image: Image, window: int, *, mask: Mask | None = None
 ) -> Image:
-    """Values of an image at the pixel of each window where another is greatest.
+    """Return an image's values where another is largest in the window of each pixel.
 
     Args:
-        by: what is greatest there, finite, shape [H,W,1].
-        image: values of any unit, shape [H,W,C].
-        window: width w of the window in pixels, odd.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        by: the other image, finite, shape [H,W,1].
+        image: shape [H,W,C].
+        window: width w in pixels, odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the values, of one pixel for all channels, shape [H,W,C]; 0 where no pixel of
-        the window takes part.
+        the values, all channels of one pixel, shape [H,W,C]; 0 where the window
+        includes no pixel.
 
     Raises:
-        ValueError: if `window` is even or less than one.
+        ValueError: if `window` is even or below one.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> size = jnp.array([3.0, 1.0, 2.0, 0.0]).reshape(1, 4, 1)
         >>> print(at_window_max(size, -size, 3)[..., 0])
         [[-3. -3. -2. -2.]]
@@ -174,15 +174,15 @@ def at_window_max(
 def separable_sum(
     image: Image, kernel: Float[ArrayLike, " taps"], *, mask: Mask | None = None
 ) -> Image:
-    """Sum over the window with weights kernel[row] * kernel[column].
+    """Sum over the window of each pixel with weights kernel[row] * kernel[column].
 
     Args:
-        image: values of any unit, shape [H,W,C].
-        kernel: weights along either axis, an odd number of them.
-        mask: pixels that take part, shape [H,W,1]; None for all.
+        image: shape [H,W,C].
+        kernel: weights along either axis, shape [w], w odd.
+        mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
-        the sums, in the unit of `image`, shape [H,W,C].
+        the sums, shape [H,W,C].
 
     Raises:
         ValueError: if the kernel's length is even.
@@ -210,18 +210,18 @@ def separable_sum(
 def window_count(
     shape: tuple[int, ...], window: int, *, dtype: jnp.dtype | type = jnp.float32
 ) -> Float[Array, "h w 1"]:
-    """Number p_c of pixels in the clipped window of each pixel; costs no sum.
+    """Count the pixels in the clipped window of each pixel, without a sum.
 
     Args:
-        shape: of the image, at least (H, W).
-        window: width w of the window in pixels, odd.
+        shape: of the image, (H, W, ...).
+        window: width w in pixels, odd.
         dtype: of the result.
 
     Returns:
         the counts, shape [H,W,1].
 
     Raises:
-        ValueError: if `window` is even or less than one.
+        ValueError: if `window` is even or below one.
 
     Example:
         >>> print(window_count((2, 3), 3)[..., 0])
@@ -237,8 +237,27 @@ def window_count(
     return jnp.asarray(np.outer(along(shape[0]), along(shape[1]))[..., None], dtype)
 
 
+def reach_of(*windows: int) -> int:
+    """Return how far windows see that are applied one after another.
+
+    Args:
+        windows: widths in pixels, odd.
+
+    Returns:
+        pixels to either side, the sum of w // 2.
+
+    Raises:
+        ValueError: if a width is even or below one.
+
+    Example:
+        >>> reach_of(7, 7, 19)
+        15
+    """
+    return sum(check_window(window) // 2 for window in windows)
+
+
 def check_window(window: int) -> int:
-    """The window if it is odd and positive.
+    """Return the window's width; raise unless it is odd and positive.
 
     Args:
         window: width in pixels.
@@ -247,7 +266,7 @@ def check_window(window: int) -> int:
         the same width.
 
     Raises:
-        ValueError: otherwise; raised while tracing.
+        ValueError: while tracing.
 
     Example:
         >>> check_window(4)
@@ -261,18 +280,18 @@ def check_window(window: int) -> int:
 
 
 def _only(image: Image, mask: Mask | None, neutral: float) -> Image:
-    """The image with `neutral` where a pixel takes no part."""
+    """Return the image with `neutral` at excluded pixels."""
     return image if mask is None else jnp.where(mask, image, neutral)
 
 
 def _ones(image: Image, mask: Mask | None) -> Float[Array, "h w 1"]:
-    """One for each pixel that takes part."""
+    """Return 1 at included pixels, 0 elsewhere."""
     ones = jnp.ones_like(image[..., :1])
     return ones if mask is None else mask.astype(image.dtype)
 
 
 def _add_columns(image: Image, window: int) -> Image:
-    """Sum over the w columns about each pixel by doubling."""
+    """Sum over the w columns about each pixel, by doubling."""
     r, width = window // 2, image.shape[1]
     span, run = 1, jnp.pad(image, ((0, 0), (r, r), (0, 0)))
     total, start = None, 0  # over columns [0, start) from the window's left edge
@@ -291,10 +310,10 @@ def _add_columns(image: Image, window: int) -> Image:
 def _add_rows(image: Image, window: int) -> Image:
     """Sum over the w rows about each pixel.
 
-    Many rows in two steps: of runs of m rows, and of q runs, m apart.
+    Many rows in two steps: over runs of m rows, then over q runs, m apart.
     """
     r, height = window // 2, image.shape[0]
-    # A concrete initial value, else jit loses the reverse derivative.
+    # Concrete: with a traced initial value jit loses the reverse derivative.
     start = np.zeros((), image.dtype)
 
     def rows(image: Array, count: int, ends: tuple[int, int], apart: int = 1) -> Array:
@@ -312,7 +331,7 @@ def _add_rows(image: Image, window: int) -> Image:
 
 
 def _extremum(image: Image, window: int, pick: Callable, neutral: float) -> Image:
-    """Least or greatest by doubling; two runs may overlap, unlike those of a sum."""
+    """Reduce by doubling; two runs may overlap, unlike those of a sum."""
     r = check_window(window) // 2
     for axis in (1, 0):
         ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
@@ -329,7 +348,7 @@ def _extremum(image: Image, window: int, pick: Callable, neutral: float) -> Imag
 
 
 def _gaussian(window: int, sigma: float) -> np.ndarray:
-    """Gaussian weights along one axis, of total one."""
+    """Return Gaussian weights along one axis, which sum to one."""
     r = check_window(window) // 2
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")

@@ -1,8 +1,9 @@
-"""Who wrote this EXR file, and what its channels mean.
+"""Recognise who wrote an EXR file, and read its channels.
 
-One function a dialect maps a path to the arguments of `make_frame`. What each writes:
+Each dialect has one function from a path to the arguments of `make_frame`. What the
+programs write:
 
-    jscomb     everything; see `own`
+    jscomb     a whole frame, see `native`
     mitsuba    R G B, or <nested>.R with A; <name>.R albedo, <name>.X normal,
                <name>.T depth; m2_<name>.* second moments of single samples
     pbrt       R G B, Albedo.R, Ns.X (shading) or N.X, Variance.R of one sample
@@ -10,50 +11,57 @@ One function a dialect maps a path to the arguments of `make_frame`. What each w
                <view>.Denoising Albedo.R, Denoising Normal.X, Denoising Depth.Z (or
                DiffCol, Normal, Depth); Denoising Variance.R of one sample, from before
                2.93; attribute cycles.<view>.samples
-    tungsten   a directory: color.exr, colorA.exr, colorB.exr, likewise albedo, normal,
-               depth, visibility; colorVariance.exr of the mean; <m>/<m>.exr,
-               <m>A.exr, <m>B.exr biased images (the layout of Ensemble Denoising)
+    tungsten   a directory: color.exr, colorA.exr, colorB.exr, the same for albedo,
+               normal, depth, visibility; colorVariance.exr of the mean; <m>/<m>.exr,
+               <m>A.exr, <m>B.exr estimates (the layout of Ensemble Denoising)
     njs        default.R, subColorA.R, albedo.R, albedoA.R, ..., colorVariance.R of the
                mean (the file of the Neural James-Stein Combiner); half B = 2 full - A.
-               Its denoised images are files of their own: read them with `read_image`
+               Its denoised images are separate files: read them with `read_image`
     pd         R G B, Albedo.R, Normal.X, Variance.R of the mean (Progressive
-               Denoising); <name>.den.exr beside <name>.exr is biased
-    idu        <scene>_<samples>spp_randImg_0.exr, _1, ... sub-buffers; _corrImg_0, ...
-               likewise (Input-Dependent Uncorrelated Weighting)
+               Denoising); <name>.den.exr beside <name>.exr is an estimate
+    idu        <scene>_<samples>spp_randImg_0.exr, _1, ... sub-buffers; the same for
+               _corrImg_0, ... (Input-Dependent Uncorrelated Weighting)
     oidn       <name>_<samples>spp.hdr.exr, with .alb.exr, .nrm.exr beside it;
-               <name>_ref.hdr.exr (reference, gt, target), or that of the most samples,
-               is the reference (training data of Open Image Denoise)
-    rgb        R G B, or Y, and nothing else that is known
+               <name>_ref.hdr.exr (reference, gt, target), or the file with the most
+               samples, is the reference (training data of Open Image Denoise)
+    rgb        R G B, or Y, and no other known channel
 """
 
 import os
 import re
 from collections.abc import Callable
 
-from jscomb.exr import own
-from jscomb.exr.dialects import authors, renderers
-from jscomb.exr.dialects.images import Arguments, Asked, rgb, single
-from jscomb.exr.files import read_parts
+from jscomb.exr import native
+from jscomb.exr._files import read_parts
+from jscomb.exr.dialects import _authors, _renderers
+from jscomb.exr.dialects._images import Arguments, Options, rgb, single
 from jscomb.frame import Frame
+
+__all__ = ["DIALECTS", "Options", "recognise"]
 
 
 def recognise(path: str) -> str:
-    """The dialect of a file or directory, from its name and contents.
+    """Return the dialect of a file or directory, from its name and contents.
 
     Args:
-        path: an EXR file or a directory.
+        path: EXR file or directory.
 
     Returns:
         a key of `DIALECTS`.
 
     Raises:
-        ValueError: if the file cannot be read or has no colour that is known; names
+        ValueError: if the file cannot be read or has no known colour channels; lists
             its channels.
+
+    Example:
+        >>> from jscomb import exr
+        >>> print(recognise(str(exr.bundled()["cornell-glass-64"])))
+        jscomb
     """
     if os.path.isdir(path):
         return "tungsten"
     parts = read_parts(path, header_only=True)
-    if own.is_own(parts):
+    if native.is_native(parts):
         return "jscomb"
     header = parts[0].attributes
     names = {channel.name for channel in header["channels"]}
@@ -69,9 +77,9 @@ def recognise(path: str) -> str:
         return "pd"
     if {"Variance.R", "Ns.X", "Nsx", "P.X", "Albedo.R"} & names:
         return "pbrt"
-    if path.endswith(authors.HDR):
+    if path.endswith(_authors.HDR):
         return "oidn"
-    if re.search(rf"{authors.NUMBERED}\d+\.exr$", path):
+    if re.search(rf"{_authors.NUMBERED}\d+\.exr$", path):
         return "idu"
     if {"R", "G", "B"} <= names or "Y" in names:
         return "rgb"
@@ -79,26 +87,26 @@ def recognise(path: str) -> str:
     raise ValueError(f"{path}: no colour channels R, G, B (or Y) among {listed}")
 
 
-def _own(path: str, asked: Asked) -> Frame:
-    """Jscomb's own multi-part file."""
-    parts = read_parts(path, max_bytes=asked.max_bytes)
-    return own.from_parts(parts, asked.samples, asked.statistics)
+def _native(path: str, options: Options) -> Frame:
+    """Read jscomb's own format."""
+    parts = read_parts(path, max_bytes=options.max_bytes)
+    return native.from_parts(parts, options.samples, options.statistics)
 
 
-def _rgb(path: str, asked: Asked) -> Arguments:
-    """Colour alone."""
-    return {"color": rgb(single(path, asked), ""), "samples": asked.samples}
+def _rgb(path: str, options: Options) -> Arguments:
+    """Read colour alone."""
+    return {"color": rgb(single(path, options), ""), "samples": options.samples}
 
 
-DIALECTS: dict[str, Callable[[str, Asked], Arguments | Frame]] = {
-    "jscomb": _own,
-    "mitsuba": renderers.mitsuba,
-    "pbrt": renderers.pbrt,
-    "blender": renderers.blender,
-    "tungsten": renderers.tungsten,
-    "njs": authors.njs,
-    "pd": authors.pd,
-    "idu": authors.idu,
-    "oidn": authors.oidn,
+DIALECTS: dict[str, Callable[[str, Options], Arguments | Frame]] = {
+    "jscomb": _native,
+    "mitsuba": _renderers.mitsuba,
+    "pbrt": _renderers.pbrt,
+    "blender": _renderers.blender,
+    "tungsten": _renderers.tungsten,
+    "njs": _authors.njs,
+    "pd": _authors.pd,
+    "idu": _authors.idu,
+    "oidn": _authors.oidn,
     "rgb": _rgb,
 }

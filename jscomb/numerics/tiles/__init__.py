@@ -1,16 +1,43 @@
-"""Large images in parts: cut, worked on, and put together again."""
+"""Large images in parts: cut apart, computed a part at a time, joined again."""
 
-from jscomb.numerics.tiles.crops import Crop as Crop
-from jscomb.numerics.tiles.crops import Local as Local
-from jscomb.numerics.tiles.crops import crops as crops
-from jscomb.numerics.tiles.crops import map_crops as map_crops
-from jscomb.numerics.tiles.crops import stream_crops as stream_crops
-from jscomb.numerics.tiles.crops import tile_within as tile_within
-from jscomb.numerics.tiles.devices import map_shards as map_shards
-from jscomb.numerics.tiles.neighbourhoods import Grid as Grid
-from jscomb.numerics.tiles.neighbourhoods import Planes as Planes
-from jscomb.numerics.tiles.neighbourhoods import Region as Region
-from jscomb.numerics.tiles.neighbourhoods import flat as flat
-from jscomb.numerics.tiles.neighbourhoods import fold_rows as fold_rows
-from jscomb.numerics.tiles.neighbourhoods import map_rows as map_rows
-from jscomb.numerics.tiles.neighbourhoods import sum_over_tiles as sum_over_tiles
+from jscomb.numerics.tiles._crops import (
+    Crop,
+    Local,
+    Span,
+    crops,
+    map_crops,
+    stream_crops,
+    tile_within,
+)
+from jscomb.numerics.tiles._devices import map_shards
+from jscomb.numerics.tiles._neighbourhoods import (
+    Grid,
+    Planes,
+    Region,
+    flat,
+    fold_rows,
+    map_rows,
+    sum_over_tiles,
+)
+from jscomb.numerics.tiles._plans import network_plan
+from jscomb.numerics.tiles._programs import compiled
+
+__all__ = [
+    "Crop",
+    "Grid",
+    "Local",
+    "Planes",
+    "Region",
+    "Span",
+    "compiled",
+    "crops",
+    "flat",
+    "fold_rows",
+    "map_crops",
+    "map_rows",
+    "map_shards",
+    "network_plan",
+    "stream_crops",
+    "sum_over_tiles",
+    "tile_within",
+]

@@ -1,12 +1,40 @@
-"""How much one pixel counts in the window of another."""
+"""How much one pixel counts in the window of another.
 
-from jscomb.numerics.weights.kinds import bilateral_weights as bilateral_weights
-from jscomb.numerics.weights.kinds import feature_weights as feature_weights
-from jscomb.numerics.weights.kinds import gaussian_weights as gaussian_weights
-from jscomb.numerics.weights.kinds import in_noise as in_noise
-from jscomb.numerics.weights.kinds import least_of as least_of
-from jscomb.numerics.weights.kinds import noise_free_weights as noise_free_weights
-from jscomb.numerics.weights.pairs import Pairs as Pairs
-from jscomb.numerics.weights.pairs import Weights as Weights
-from jscomb.numerics.weights.pairs import tile_weights as tile_weights
-from jscomb.numerics.weights.pairs import weighted_mean as weighted_mean
+Layout: images, guides and features [H,W,*]; windows as in `jscomb.numerics.windows`.
+Notation:
+
+    c, i   centre of a window, and a pixel in it
+    w_ci   weight of the pixel, at least zero
+
+`weighted_mean` walks the windows and holds one weight a pixel at a time; a regression
+needs all weights of a tile at once, as the matrix `tile_weights`.
+`denoisers.nonlocal_means` has another kind of weights.
+"""
+
+from jscomb.numerics.weights._kinds import (
+    bilateral_weights,
+    feature_weights,
+    gaussian_weights,
+    minimum_of,
+    noise_free_weights,
+    normalised_distance,
+)
+from jscomb.numerics.weights._pairs import (
+    Pairs,
+    Weights,
+    tile_weights,
+    weighted_mean,
+)
+
+__all__ = [
+    "Pairs",
+    "Weights",
+    "bilateral_weights",
+    "feature_weights",
+    "gaussian_weights",
+    "minimum_of",
+    "noise_free_weights",
+    "normalised_distance",
+    "tile_weights",
+    "weighted_mean",
+]

@@ -1,0 +1,276 @@
+"""From errors to weights, and from weights to the image."""
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jscomb.ensemble._estimate import SCALES, Bases, check_bases, error_matrix
+from jscomb.numerics import simplex
+from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
+from jscomb.numerics.weights import bilateral_weights, weighted_mean
+from jscomb.typing import Image, Key, Variance
+
+Guide = Float[Array, "h w _"]
+Solver = Literal["hull", "iterative", "reference", "multi-scale"]
+
+
+def combine(
+    biased: Bases,
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    solver: Solver = "hull",
+    filter: bool = True,
+    albedo: Guide | None = None,
+    normal: Guide | None = None,
+    solver_key: Key | None = None,
+    windows: Sequence[int] = SCALES,
+    shared: bool = True,
+) -> Image:
+    """Combine any number of bases by the weights of minimum estimated error.
+
+    Pure, scale-equivariant, and differentiable in every array with the exact solvers.
+    The default is the paper's method; `solver="multi-scale", filter=False` measures
+    better, and most often better than the best base.
+
+    Args:
+        biased: y, each base of the full frame, radiance, shape [N,H,W,C]. The unbiased
+            image may be one of them, which makes the result consistent.
+        biased_a: the bases made from half a, same shape.
+        biased_b: the bases made from half b, same shape.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, same shape.
+        solver: see `solve_weights`.
+        filter: smooth the weights by `filter_weights`.
+        albedo: guide of the filter, shape [H,W,3]; optional, as is the normal.
+        normal: guide of the filter, shape [H,W,3].
+        solver_key: of the iterative solver, a typed key.
+        windows: of "multi-scale".
+        shared: of "multi-scale", one weight for all channels.
+
+    Returns:
+        the combined image, radiance, shape [H,W,C]; at a pixel where a base is not
+        finite the first that is, else 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, there is no base, or as
+            `solve_weights`.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> y, x = at(1.0, 4.0), at(2.0)[0]
+        >>> print(combine(y, y, y, x, x, filter=False)[0, 0].round(3))
+        [2.]
+
+    Source: ED section 4.
+    """
+    weights = filtered_weights(
+        biased,
+        biased_a,
+        biased_b,
+        unbiased_a,
+        unbiased_b,
+        solver=solver,
+        filter=filter,
+        albedo=albedo,
+        normal=normal,
+        solver_key=solver_key,
+        windows=windows,
+        shared=shared,
+    )
+    return average(biased, weights)
+
+
+def filtered_weights(
+    biased: Bases,
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    filter: bool,
+    albedo: Guide | None,
+    normal: Guide | None,
+    **options: Any,
+) -> Bases:
+    """The weights of `combine`; options are those of `solve_weights`."""
+    if biased.shape != biased_a.shape:
+        raise ValueError(f"biased is {biased.shape}, biased_a is {biased_a.shape}")
+    weights = solve_weights(biased_a, biased_b, unbiased_a, unbiased_b, **options)
+    if not filter:
+        return weights
+    z, z_a, z_b = (average(y, weights) for y in (biased, biased_a, biased_b))
+    noise = jnp.square(z_a - z_b) / 2
+    return filter_weights(weights, z, noise, albedo=albedo, normal=normal)
+
+
+def solve_weights(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    *,
+    solver: Solver = "hull",
+    solver_key: Key | None = None,
+    windows: Sequence[int] = SCALES,
+    shared: bool = True,
+) -> Bases:
+    """Solve for the weights of the bases at every pixel.
+
+    Args:
+        biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
+        biased_b: y^b, made from half b.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, same shape.
+        solver: "hull", the paper's objective of single pixels and channels, exactly;
+            "iterative" and "reference", the same by the paper's solver and by jaxopt;
+            "multi-scale", ours: `quadratic` on `error_matrix`.
+        solver_key: of the iterative solver, a typed key.
+        windows: of "multi-scale".
+        shared: of "multi-scale", one weight for all channels.
+
+    Returns:
+        the weights, at least zero, of sum one, shape [N,H,W,C]; at an invalid pixel
+        1/N, or those of the pixels around it.
+
+    Raises:
+        ValueError: while tracing, if shapes differ, there is no base, the solver is
+            unknown, or lacks its key.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> y, x = at(1.0, 4.0), at(2.0)[0]
+        >>> print([f"{share:.3f}" for share in solve_weights(y, y, x, x).ravel()])
+        ['0.667', '0.333']
+
+    Source: ED eq. 13, 14.
+    """
+    check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
+    images = biased_a, biased_b, unbiased_a, unbiased_b
+    if solver == "multi-scale":
+        matrix = error_matrix(*images, windows=windows, shared=shared)
+        weights = simplex.quadratic(matrix)
+        return jnp.broadcast_to(weights, biased_a.shape)
+    _, *clean = zero_invalid(*images)
+    if solver == "hull":
+        return simplex.hull(*clean)
+    if solver == "reference":
+        return simplex.reference(*clean)
+    if solver != "iterative":
+        raise ValueError(f"solver must be one of {get_args(Solver)}, got {solver!r}")
+    if solver_key is None:
+        raise ValueError("the iterative solver needs solver_key")
+    return simplex.iterative(solver_key, *clean)
+
+
+def one_hot(errors: Bases) -> Bases:
+    """Return weights that select the base of minimum error.
+
+    Args:
+        errors: of each base at each pixel, for example the diagonal of `mse_matrix`,
+            filtered or not, shape [N,H,W,C].
+
+    Returns:
+        1 for the base of minimum error, the first of equals, else 0, shape [N,H,W,C].
+
+    Example:
+        >>> errors = jnp.array([2.0, 1.0, 3.0]).reshape(3, 1, 1, 1)
+        >>> print(one_hot(errors).ravel())
+        [0. 1. 0.]
+
+    Source: ED eq. 36, 37.
+    """
+    best = jnp.argmin(errors, axis=0)
+    return jax.nn.one_hot(best, len(errors), axis=0, dtype=errors.dtype)
+
+
+def filter_weights(
+    weights: Bases,
+    combined: Image,
+    variance: Variance,
+    *,
+    albedo: Guide | None = None,
+    normal: Guide | None = None,
+    radius: int = 7,
+    sigma: float = 3.0,
+    sigma_radiance: float = 2.0,
+    sigma_albedo: float = 0.25,
+    sigma_normal: float = 0.15,
+) -> Bases:
+    """Smooth weights where image and features are smooth.
+
+    Args:
+        weights: of the bases, shape [N,H,W,C].
+        combined: z, the ensemble with these weights, radiance, shape [H,W,C].
+        variance: of z, squared radiance, shape [H,W,C].
+        albedo: shape [H,W,3]; optional, as is the normal.
+        normal: shape [H,W,3].
+        radius: of the windows, in pixels.
+        sigma: standard deviation of the distance, in pixels.
+        sigma_radiance: of z, in units of its noise.
+        sigma_albedo: of the albedo.
+        sigma_normal: of the normal.
+
+    Returns:
+        the filtered weights, shape [N,H,W,C]; unchanged at pixels that are not finite
+        in some guide.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `sigma` is not positive.
+
+    Example:
+        >>> row = lambda *values: jnp.tile(jnp.array(values)[None, :, None], 3)
+        >>> w, edge = row(0.0, 0.4, 0.6, 1.0), row(0.0, 0.0, 1.0, 1.0)
+        >>> z = jnp.ones_like(w)
+        >>> found = filter_weights(w[None], z, z, albedo=edge, radius=1, sigma=100.0)
+        >>> print([f"{share:.2f}" for share in found[0, 0, :, 0]])
+        ['0.20', '0.20', '0.80', '0.80']
+
+    Source: ED eq. 32-34, with the constants of section 4.2.
+    """
+    n, h, w, c = weights.shape
+    check_same_shape(combined=combined, variance=variance)
+    scaled = [
+        image / (2**0.5 * s)
+        for image, s in ((albedo, sigma_albedo), (normal, sigma_normal))
+        if image is not None
+    ]
+    for name, image in (("weights", weights[0]), *(("a guide", i) for i in scaled)):
+        if image.shape[:2] != combined.shape[:2]:
+            raise ValueError(f"{name} has {image.shape}, combined {combined.shape}")
+    none = jnp.zeros((h, w, 0), combined.dtype)
+    guide = jnp.concatenate([none, *scaled], axis=-1)
+    flat = jnp.moveaxis(weights, 0, 2).reshape(h, w, n * c)
+    alike = bilateral_weights(
+        guide, combined / (2**0.5 * sigma_radiance), variance, sigma=sigma
+    )
+    filtered = weighted_mean(flat, alike, window=2 * radius + 1)
+    return jnp.moveaxis(filtered.reshape(h, w, n, c), 2, 0)
+
+
+def average(biased: Bases, weights: Bases) -> Image:
+    """Average the bases with weights: the ensemble.
+
+    Args:
+        biased: y, radiance, shape [N,H,W,C].
+        weights: of sum one, shape [N,H,W,C].
+
+    Returns:
+        the image, shape [H,W,C]; at a pixel where a base is not finite the first that
+        is, else 0.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> print(average(at(1.0, 5.0), at(0.75, 0.25))[0, 0])
+        [2.]
+
+    Source: ED eq. 3.
+    """
+    valid, clean = zero_invalid(biased)
+    total = jnp.sum(weights * clean, axis=0)
+    return jnp.where(valid, total, first_finite(*biased))

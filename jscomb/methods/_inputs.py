@@ -1,0 +1,174 @@
+"""What a method is given of a frame: its estimates, made where they are missing."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from jscomb.frame import Estimate, Frame, Maker
+from jscomb.methods._table import BASES, METHODS
+from jscomb.typing import Key
+
+_DENOISER = "oidn"  # for frames without an estimate
+
+
+def inputs(
+    frame: Frame, *, biased: str | Sequence[str] | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return which bases an ensemble of a frame has, and why others are skipped.
+
+    Args:
+        frame: the frame.
+        biased: names of estimates and denoisers; None for all of the frame's estimates
+            and `BASES`.
+
+    Returns:
+        the names, and the reasons by name.
+
+    Raises:
+        ValueError: if a name is neither an estimate nor a method.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> names, skipped = inputs(make_frame(jnp.ones((2, 4, 4, 1))).normalised())
+        >>> print(names, sorted(skipped))
+        () ['bilateral', 'oidn', 'oidn-color', 'pd', 'rdfc']
+    """
+    if isinstance(biased, str):
+        biased = [biased]
+    wanted = [*frame.estimates, *BASES] if biased is None else list(biased)
+    names, skipped = [], {}
+    for name in dict.fromkeys(wanted):
+        if name in frame.estimates:
+            has = frame.estimates[name].halves is not None
+            reason = "" if has or can_make(name, frame) else "it has no halves"
+        elif name in METHODS:
+            reason = METHODS[name].needs.missing_for_halves(frame)
+            reason = f"needs {reason}" if reason else ""
+        else:
+            raise ValueError(_unknown(name, frame))
+        if reason:
+            skipped[name] = reason
+        else:
+            names.append(name)
+    return tuple(names), skipped
+
+
+def given_to(
+    key: Key, frame: Frame, method: str, biased: str | Sequence[str] | None
+) -> tuple[Frame, tuple[Any, ...]]:
+    """The frame with the estimates that a method takes, and the makers of those."""
+    if method not in METHODS:
+        raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
+    chosen = METHODS[method]
+    frame.require(method, chosen.needs)
+    if chosen.takes == "nothing":
+        if biased not in (None, chosen.denoiser):
+            raise ValueError(f"{method} takes no biased image, got {biased!r}")
+        return frame, ()
+    if chosen.takes == "estimates":
+        names, skipped = inputs(frame, biased=biased)
+        if not names:
+            raise ValueError(f"{method} has no bases: {_listed(skipped)}")
+        for name in names:
+            frame = with_input(key, frame, name)
+        return frame, ({name: _maker(key, frame, name) for name in names},)
+    name = input_name(frame, biased=biased)
+    frame = with_input(key, frame, name)
+    return frame, (_maker(key, frame, name),)
+
+
+def taken_by(
+    method: str, biased: str | Sequence[str] | None
+) -> str | Sequence[str] | None:
+    """The biased image, if the method takes one; None for what it takes by itself."""
+    return biased if METHODS[method].takes == "one estimate" else None
+
+
+def _listed(reasons: Mapping[str, str]) -> str:
+    """Names and reasons in one line."""
+    return "; ".join(f"{name} {reason}" for name, reason in reasons.items())
+
+
+def input_name(frame: Frame, *, biased: str | Sequence[str] | None = None) -> str:
+    """Return the name of the biased image that a method of one estimate takes.
+
+    Args:
+        frame: the frame.
+        biased: as for `combine`.
+
+    Returns:
+        the name.
+
+    Raises:
+        ValueError: if there are several and none is named, or the name is unknown.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> print(input_name(make_frame(jnp.ones((2, 4, 4, 3)))))
+        oidn
+    """
+    held = list(frame.estimates)
+    if biased is None:
+        if len(held) > 1:
+            raise ValueError(
+                f"which biased image? this frame has {', '.join(held)}: name one by "
+                "biased (--biased)"
+            )
+        return held[0] if held else _DENOISER
+    if not isinstance(biased, str):
+        raise ValueError(f"expected one biased image, got {list(biased)}")
+    if biased not in held and biased not in METHODS:
+        raise ValueError(_unknown(biased, frame))
+    return biased
+
+
+def _unknown(name: str, frame: Frame) -> str:
+    """The error for a biased image that is neither held nor can be made."""
+    held = ", ".join(frame.estimates) or "none"
+    return (
+        f"no biased image {name!r}: this frame has {held}, and there is no such method"
+    )
+
+
+def with_input(key: Key, frame: Frame, name: str) -> Frame:
+    """The frame with an estimate, made if it is not there."""
+    if name in frame.estimates:
+        return frame
+    method = METHODS[name]
+    frame.require(name, method.needs)
+    if method.takes != "nothing":
+        raise ValueError(
+            f"{name} takes a biased image itself: make it first, and add it by "
+            f"frame.with_estimate({name!r}, ...)"
+        )
+    return frame.with_estimate(name, method.estimate(key, frame))
+
+
+def can_make(name: str, frame: Frame) -> bool:
+    """Whether the table's method of this name can make it anew of a half."""
+    method = METHODS.get(name)
+    return (
+        method is not None
+        and method.takes == "nothing"
+        and not method.needs.missing_for_halves(frame)
+    )
+
+
+def _maker(key: Key, frame: Frame, name: str) -> Estimate | Maker:
+    """The estimate of any part of a frame, with halves where a denoiser can make them.
+
+    An estimate whose name is no denoiser's stays what it is.
+    """
+    if not can_make(name, frame):
+        return frame.estimates[name]
+    method = METHODS[name]
+
+    def make(part: Frame) -> Estimate:
+        image, halves = part.estimates[name]
+        if halves is None and not method.needs.missing_for_halves(part):
+            of_halves = [method.image(key, half) for half in part.halves()]
+            halves = jnp.stack(of_halves)
+        return Estimate(image, halves)
+
+    return make

@@ -1,0 +1,179 @@
+"""The table of methods: everything that names one reads it."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+
+from jscomb import double_shrinkage, ensemble, james_stein, progressive
+from jscomb.denoisers import bilateral, nfor, nonlocal_means, oidn, rdfc, smoothing
+from jscomb.frame import Estimate, Frame, Needs, with_halves
+from jscomb.numerics.tiles import Local
+from jscomb.typing import Image, Key
+
+
+class Method(NamedTuple):
+    """A denoiser or combiner: a `plan`, or a `make` for what has none.
+
+    Attributes:
+        summary: what it does, in one line.
+        needs: what it needs of a frame.
+        takes: what it takes beside the frame: nothing, one estimate, or several by
+            name.
+        plan: of a key, a normalised frame and its estimates, to a local function of
+            images.
+        make: of a key, a normalised frame and what it takes (each an `Estimate` or a
+            `Maker`), to an `Estimate`.
+        denoiser: the denoiser that it runs by itself, where it takes no estimate.
+        pure: decides on no values, for `jit` and `vmap`.
+    """
+
+    summary: str
+    needs: Needs
+    takes: Literal["nothing", "one estimate", "estimates"]
+    plan: Callable[..., Local] | None = None
+    make: Callable[..., Estimate] | None = None
+    denoiser: str | None = None
+    pure: bool = False
+
+    def image(self, key: Key, frame: Frame, *estimates: Any) -> Image:
+        """Return the image alone, [H,W,C]."""
+        key = jax.random.clone(key)  # the parts of a frame share their probes
+        if self.plan is not None:
+            return self.plan(key, frame, *estimates).whole()
+        assert self.make is not None
+        return self.make(key, frame, *estimates).image
+
+    def estimate(self, key: Key, frame: Frame, *given: Any) -> Estimate:
+        """Return the image, and that of each half where it can be made."""
+        if self.make is not None:
+            return self.make(jax.random.clone(key), frame, *given)
+        image = functools.partial(self.image, key)
+        return with_halves(frame, image, *given, needs=self.needs)
+
+
+def _denoiser(summary: str, needs: Needs, denoise: Callable[..., Estimate], **options):
+    """A method that denoises a frame as a whole."""
+    make = lambda key, frame: denoise(frame, **options)
+    return Method(summary, needs, "nothing", make=make)
+
+
+def _filter(summary: str, room: Any) -> Method:
+    """A method that denoises a frame by a local function."""
+    plan = lambda key, frame: room.plan_frame(frame)
+    return Method(summary, room.NEEDS, "nothing", plan, pure=True)
+
+
+def _network(name: str) -> Any:
+    """The trained network of a method."""
+    from jscomb.learning.recipes import shipped  # flax is slow to import
+
+    return shipped(name)
+
+
+def _james_stein(summary: str, **options: Any) -> Method:
+    """James-Stein without its network."""
+    plan = lambda key, frame, y: james_stein.plan_frame(frame, y, **options)
+    return Method(summary, james_stein.NEEDS, "one estimate", plan, pure=True)
+
+
+METHODS: dict[str, Method] = {
+    "oidn": _denoiser(
+        "Open Image Denoise with the frame's albedo and normal",
+        oidn.NEEDS,
+        oidn.denoise_frame,
+    ),
+    "oidn-color": _denoiser(
+        "Open Image Denoise with the colour alone",
+        oidn.NEEDS,
+        oidn.denoise_frame,
+        features=False,
+    ),
+    "nfor": _denoiser(
+        "first-order regression on the features", nfor.NEEDS, nfor.denoise_frame
+    ),
+    "bilateral": _filter("joint bilateral filter", bilateral),
+    "nonlocal-means": _filter("non-local means", nonlocal_means),
+    "rdfc": _filter("non-local means restricted by the features", rdfc),
+    "gaussian": _filter("Gaussian blur", smoothing),
+    "denoised": Method(
+        "the biased image, unchanged",
+        Needs(),
+        "one estimate",
+        lambda key, frame, y: Local(lambda image: image, y.image, 0),
+        pure=True,
+    ),
+    "james-stein": _james_stein(
+        "James-Stein with one variance a 15x15 window", window=15, whiten=False
+    ),
+    "whitened": _james_stein("James-Stein with a robust variance for each pixel"),
+    "progressive": Method(
+        "mixing with Open Image Denoise by SURE",
+        progressive.NEEDS._replace(channels=3, package=oidn.NEEDS.package),
+        "nothing",
+        make=lambda key, frame: progressive.combine_frame(
+            key, oidn.denoise_color, frame
+        ),
+        denoiser="oidn",
+    ),
+    "double-shrinkage": Method(
+        "double shrinkage with errors from half buffers",
+        double_shrinkage.NEEDS,
+        "one estimate",
+        make=lambda key, frame, y: double_shrinkage.combine_frame(frame, y),
+    ),
+    "njs": Method(
+        "James-Stein with a trained network",
+        james_stein.NEURAL_NEEDS,
+        "one estimate",
+        lambda key, frame, y: james_stein.plan_neural(key, _network("njs"), frame, y),
+    ),
+    "pd": Method(
+        "progressive denoising with a trained network, of Open Image Denoise",
+        progressive.NEEDS._replace(channels=3, package=oidn.NEEDS.package),
+        "nothing",
+        lambda key, frame: progressive.plan_neural(
+            key, oidn.denoise_color, _network("pd"), frame
+        ),
+        denoiser="oidn",
+    ),
+    "dsc": Method(
+        "double shrinkage with a trained network",
+        double_shrinkage.NEEDS._replace(channels=3),
+        "one estimate",
+        lambda key, frame, y: double_shrinkage.plan_neural(_network("dsc"), frame, y),
+    ),
+    "ensemble": Method(
+        "weights of minimum error for all the frame's estimates and several denoisers",
+        ensemble.NEEDS,
+        "estimates",
+        make=lambda key, frame, bases: ensemble.combine_frame(frame, bases),
+    ),
+}
+"""By name; the cheaper first among the combiners. Uncorrelated kernels are not here:
+they combine two renderings (`uncorrelated.combine_frame`)."""
+
+CANDIDATES = "denoised", "whitened", "njs", "pd", "dsc"
+"""What `choose` chooses from, the cheapest first."""
+
+BASES = "oidn", "oidn-color", "bilateral", "rdfc", "pd"
+"""What an ensemble is made of beside a frame's own estimates."""
+
+
+def table() -> str:
+    """Return all methods as a Markdown table: name, what each does, takes and needs.
+
+    Returns:
+        the table.
+
+    Example:
+        >>> print(table().splitlines()[0])
+        | method | what it does | takes | needs |
+    """
+    rows = [
+        f"| `{name}` | {m.summary} | {m.takes} | {m.needs.summary()} |"
+        for name, m in METHODS.items()
+    ]
+    head = ["| method | what it does | takes | needs |", "| --- | --- | --- | --- |"]
+    return "\n".join([*head, *rows])

@@ -1,0 +1,96 @@
+"""The mixing of minimum error and its risk, from SURE."""
+
+import jax.numpy as jnp
+
+from jscomb.numerics.guards import check_same_shape, divide, zero_invalid
+from jscomb.numerics.windows import window_sum
+from jscomb.typing import Image, Variance
+
+# What one pixel may weigh, times the rounding error: finite however small its variance.
+_MAXIMUM_EVIDENCE = 1e4
+
+
+def mixing(
+    unbiased: Image,
+    biased: Image,
+    variance: Variance,
+    sure: Image,
+    *,
+    window: int = 15,
+    whiten: bool = False,
+) -> Image:
+    """Return the mixing of minimum estimated error over windows.
+
+    Args:
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, linear radiance, shape [H,W,C].
+        variance: v, squared radiance, at least zero, shape [H,W,C].
+        sure: s, squared radiance, of either sign, shape [H,W,C].
+        window: width of the windows in pixels, odd.
+        whiten: divide by each pixel's own variance, so that the noisiest do not
+            dominate the window; excludes pixels of variance 0. Needs a robust variance
+            (`numerics.variances.robust_variance`), in `sure` as well.
+
+    Returns:
+        alpha, in [0, 1], shape [H,W,C]; 1 where x and y agree in the whole window.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+
+    Example:
+        >>> at = lambda value: jnp.full((3, 3, 1), value)
+        >>> print(mixing(at(3.0), at(1.0), at(1.0), at(2.0))[0, 0])
+        [0.375]
+
+    Source: PD eq. 9, 10, summed over windows and channels alike.
+    """
+    check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
+    _, x, y, v, s = zero_invalid(unbiased, biased, variance, sure)
+    square, saved = jnp.square(y - x), v - s
+    if whiten:
+        maximum = _MAXIMUM_EVIDENCE / float(jnp.finfo(v.dtype).eps)
+        unit = jnp.maximum(v, jnp.maximum(square, jnp.abs(saved)) / maximum)
+        square, saved = (divide(i, unit, where=v > 0) for i in (square, saved))
+    square = window_sum(square, window)
+    gain = window_sum(saved, window) + square
+    ratio = divide(gain, 2 * square, where=square > 0, otherwise=1.0)
+    return jnp.clip(ratio, 0.0, 1.0)
+
+
+def risk(
+    mixing: Image, unbiased: Image, biased: Image, variance: Variance, sure: Image
+) -> Image:
+    """Estimate the squared error of the mixed image.
+
+    For a mixing that does not follow the noise; for one that does it is too small.
+
+    Args:
+        mixing: alpha, in [0, 1], shape [H,W,C].
+        unbiased: x, linear radiance, shape [H,W,C].
+        biased: y, linear radiance, shape [H,W,C].
+        variance: v, squared radiance, at least zero, shape [H,W,C].
+        sure: s, squared radiance, of either sign, shape [H,W,C].
+
+    Returns:
+        the estimate at each element, squared radiance, noisy, of either sign, shape
+        [H,W,C]; average before use. 0 at invalid pixels.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> at = lambda value: jnp.full((1, 1, 1), value)
+        >>> for alpha in (0.0, 0.375, 1.0):  # x alone, the best mixing, y alone
+        ...     print(risk(at(alpha), at(3.0), at(1.0), at(1.0), at(2.0))[0, 0])
+        [1.]
+        [0.4375]
+        [2.]
+
+    Source: PD eq. 8.
+    """
+    check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased)
+    check_same_shape(mixing=mixing, variance=variance, sure=sure)
+    _, alpha, x, y, v, s = zero_invalid(mixing, unbiased, biased, variance, sure)
+    divergence = (s - jnp.square(y - x) + v) / 2
+    beta = 1 - alpha
+    return beta**2 * v + alpha**2 * s + 2 * alpha * beta * divergence

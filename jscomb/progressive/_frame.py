@@ -1,0 +1,163 @@
+"""Progressive denoising of frames, without and with the network.
+
+A denoiser is an argument: `denoise(color, frame)` returns a frame's colour denoised,
+guided by the frame's features, and has forward derivatives in the colour, such as
+`denoisers.oidn.denoise_color`.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from jscomb.frame import Estimate, Frame, Needs, with_halves
+from jscomb.numerics.sure import monte_carlo_sure
+from jscomb.numerics.tiles import Local, compiled, network_plan
+from jscomb.numerics.variances import robust_variance
+from jscomb.progressive._combine import combine
+from jscomb.progressive._estimate import mixing
+from jscomb.progressive._neural import Network, combine_inputs
+from jscomb.typing import Image, Key
+
+Denoise = Callable[[Image, Frame], Any]
+
+NEEDS = Needs(variance=True, normalised=True)
+
+
+def combine_frame(
+    key: Key, denoise: Denoise, frame: Frame, *, bound: bool = True
+) -> Estimate:
+    """Denoise a frame, and mix by SURE without a network, whitened.
+
+    Args:
+        key: of SURE's probe, which the halves share.
+        denoise: denoiser of a colour and its frame.
+        frame: normalised, with variance.
+        bound: lower the mixing where it is not consistent with the noise.
+
+    Returns:
+        the mix, normalised radiance.
+
+    Raises:
+        ValueError: if the frame has no variance or is not normalised.
+
+    Example:
+        >>> from jscomb.denoisers import smoothing
+        >>> from jscomb.frame import make_frame
+        >>> noisy = 1 + 0.3 * jax.random.normal(jax.random.key(0), (2, 32, 32, 1))
+        >>> frame = make_frame(noisy, variance=0 * noisy + 0.09).normalised()
+        >>> box = lambda color, frame: smoothing.box(color)
+        >>> made = combine_frame(jax.random.key(1), box, frame)
+        >>> print(f"{frame.color.std():.2f} {made.image.std():.2f}")
+        0.21 0.05
+
+    Source: PD eq. 9-18.
+    """
+    frame.require("progressive", NEEDS)
+    mix = compiled(_mix, bound=bound)
+    inputs = lambda part: neural_inputs(jax.random.clone(key), denoise, part)
+    make = lambda part: mix(*inputs(part).values())
+    return with_halves(frame, make, needs=NEEDS)
+
+
+def _mix(x: Image, y: Image, v: Image, s: Image, *, bound: bool) -> Image:
+    """Mix by whitened windows."""
+    mix = functools.partial(mixing, whiten=True)
+    return combine(x, y, v, s, mix=mix, bound=bound)
+
+
+def neural_combine_frame(
+    key: Key, denoise: Denoise, network: Network, frame: Frame
+) -> Estimate:
+    """Denoise a frame, and mix by a network's alpha.
+
+    Args:
+        key: of SURE's probe.
+        denoise: denoiser of a colour and its frame.
+        network: such as `learning.networks.MixingNetwork`.
+        frame: normalised, with variance.
+
+    Returns:
+        the mix, normalised radiance.
+
+    Raises:
+        ValueError: if the frame has no variance or is not normalised.
+
+    Example:
+        >>> from jscomb.denoisers import smoothing
+        >>> from jscomb.frame import make_frame
+        >>> from jscomb.learning.recipes import shipped
+        >>> noisy = 1 + 0.3 * jax.random.normal(jax.random.key(0), (2, 32, 32, 3))
+        >>> frame = make_frame(noisy, variance=0 * noisy + 0.09).normalised()
+        >>> box = lambda color, frame: smoothing.box(color)
+        >>> made = neural_combine_frame(jax.random.key(1), box, shipped("pd"), frame)
+        >>> print(made.image.std() < 0.5 * frame.color.std())
+        True
+
+    Source: PD eq. 11, 19; alpha as one output and no bound.
+    """
+    frame.require("pd", NEEDS)
+    plan = lambda part: plan_neural(jax.random.clone(key), denoise, network, part)
+    make = lambda part: plan(part).whole()
+    return with_halves(frame, make, needs=NEEDS)
+
+
+def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> Local:
+    """Return `neural_combine_frame` as a local function of images, for crops.
+
+    Args:
+        key: of SURE's probe.
+        denoise: denoiser of a colour and its frame.
+        network: as in `neural_combine_frame`.
+        frame: normalised, with variance.
+
+    Returns:
+        the function, its images and how far it sees.
+
+    Raises:
+        ValueError: if the frame has no variance or is not normalised.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jscomb.frame import make_frame
+        >>> from jscomb.learning.recipes import shipped
+        >>> one = jnp.ones((4, 4, 3), jnp.float32)
+        >>> frame = make_frame(one, variance=one).normalised()
+        >>> same = lambda color, frame: color
+        >>> plan = plan_neural(jax.random.key(0), same, shipped("pd"), frame)
+        >>> print(list(plan.images))
+        ['unbiased', 'biased', 'variance', 'sure']
+    """
+    inputs = neural_inputs(key, denoise, frame)
+    return network_plan(combine_inputs, network, inputs)
+
+
+def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
+    """Denoise a frame with SURE: what a mixing is chosen by.
+
+    Args:
+        key: of SURE's probe.
+        denoise: denoiser of a colour and its frame.
+        frame: normalised, with variance.
+
+    Returns:
+        x, y, robust variance and SURE, named as by `neural_combine`, in its order.
+
+    Raises:
+        ValueError: if the frame has no variance or is not normalised.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((4, 4, 3))
+        >>> frame = make_frame(one, variance=one).normalised()
+        >>> half = lambda color, frame: color / 2
+        >>> made = neural_inputs(jax.random.key(0), half, frame)
+        >>> print(f"{made['sure'].mean():.2f}")  # (1/2 - 1)^2 + 2 * 1/2 - 1
+        0.25
+    """
+    frame.require("pd", NEEDS)
+    x, v = frame.color, robust_variance(frame.variance)
+    y, s, _ = monte_carlo_sure(key, lambda color: denoise(color, frame), x, v)
+    return {"unbiased": x, "biased": y, "variance": v, "sure": s}

@@ -1,0 +1,104 @@
+"""Kernels: weights as a function of the differences of B sub-averages.
+
+A kernel takes B arrays of one shape, the differences D_ci z^1, ..., D_ci z^B, and
+returns weights in [0, 1] of that shape, elementwise.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jscomb.typing import Key, Scalar
+from jscomb.uncorrelated._pairs import Samples, check_samples
+
+Kernel = Callable[..., Array]
+
+_TRIALS = 4096
+
+
+def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
+    """Return the paper's kernel: less weight where two sub-averages differ more.
+
+    Args:
+        gamma: at least zero, per squared radiance.
+        samples: n, samples a pixel in each sub-average, at least 1.
+
+    Returns:
+        a kernel of two differences.
+
+    Raises:
+        ValueError: if `samples` is less than 1.
+
+    Example:
+        >>> kernel = variance_kernel(0.01, 8)
+        >>> weights = kernel(jnp.array([1.0, 1.0]), jnp.array([1.0, 4.0]))
+        >>> print([f"{w:.3f}" for w in weights])
+        ['1.000', '0.487']
+
+    Source: IDU eq. 8.
+    """
+    check_samples(samples)
+
+    def kernel(first: Array, second: Array) -> Array:
+        rate = rate_of(gamma, samples, first.dtype)
+        return jnp.exp(-rate * jnp.square(first - second))
+
+    return kernel
+
+
+def rate_of(gamma: Scalar | float, samples: Samples, dtype: jnp.dtype | type) -> Scalar:
+    """Gamma n, the factor of a squared difference, per squared radiance."""
+    return jnp.asarray(gamma, dtype) * jnp.asarray(samples, dtype)
+
+
+class Admissibility(NamedTuple):
+    """What theorem 2 demands of a kernel: both are zero up to rounding.
+
+    Attributes:
+        shift: maximum change of a weight when a constant is added to all differences.
+        sign: maximum change of a weight when all differences change sign.
+    """
+
+    shift: Scalar
+    sign: Scalar
+
+
+def admissibility(
+    key: Key, kernel: Kernel, *, sub_averages: int = 2, scale: float = 1.0
+) -> Admissibility:
+    """Test a kernel on random differences.
+
+    Args:
+        key: of the differences and the constants.
+        kernel: of `sub_averages` arrays.
+        sub_averages: B.
+        scale: typical size of the differences, linear radiance: where weights fall.
+
+    Returns:
+        how far the kernel is from what makes a combination unbiased.
+
+    Example:
+        >>> by_noise = lambda first, second: jnp.exp(-((first - second) ** 2))
+        >>> by_mean = lambda first, second: jnp.exp(-((first + second) ** 2))
+        >>> for kernel in (by_noise, by_mean):
+        ...     found = admissibility(jax.random.key(0), kernel)
+        ...     print(f"{found.shift:.1f} {found.sign:.1f}")
+        0.0 0.0
+        1.0 0.0
+
+    Source: IDU eq. 7.
+    """
+    of_size, of_differences, of_constants = jax.random.split(key, 3)
+    # Over four decades: a kernel may fail at any size.
+    size = scale * 10 ** jax.random.uniform(of_size, (_TRIALS,), minval=-2, maxval=2)
+    shape = (sub_averages, _TRIALS)
+    differences = size[None] * jax.random.normal(of_differences, shape)
+    constants = size * jax.random.normal(of_constants, (_TRIALS,))
+    weights = kernel(*differences)
+    return Admissibility(
+        jnp.max(jnp.abs(kernel(*(differences + constants[None])) - weights)),
+        jnp.max(jnp.abs(kernel(*-differences) - weights)),
+    )
