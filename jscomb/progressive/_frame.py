@@ -49,8 +49,8 @@ def combine_frame(
         >>> frame = make_frame(noisy, variance=0 * noisy + 0.09).normalised()
         >>> box = lambda color, frame: smoothing.box(color)
         >>> made = combine_frame(jax.random.key(1), box, frame)
-        >>> print(f"{frame.color.std():.2f} {made.image.std():.2f}")
-        0.21 0.05
+        >>> print(made.image.std() < 0.3 * frame.color.std())
+        True
 
     Source: PD eq. 9-18.
     """
