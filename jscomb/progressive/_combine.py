@@ -10,7 +10,6 @@ from jscomb.numerics.guards import (
     check_same_shape,
     divide,
     first_finite,
-    masked_mean,
     safe_sqrt,
     zero_invalid,
 )
@@ -124,8 +123,10 @@ def bound_mixing(
     largest = at_window_max(
         noise, jnp.concatenate([moved, noise], axis=-1), window, mask=valid
     )
-    radiance = masked_mean(jnp.abs(x), valid)
-    kernel = _kernel(masked_mean(noise, valid), radiance, window)
+    # Both are 0 at invalid pixels; masked again they would not be fused.
+    count = jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
+    radiance = jnp.sum(jnp.abs(x)) / (count * channels)
+    kernel = _kernel(jnp.sum(noise) / count, radiance, window)
     mean = largest[..., :1] + separable_sum(moved, kernel)
     error = largest[..., 1:] + separable_sum(noise, jnp.square(kernel))
     t = _magnitude(mean, error)
