@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jscomb.numerics.guards import finite
 from jscomb.numerics.luminance import median_luminance
+from jscomb.numerics.tiles import compiled
 from jscomb.typing import Image, Mask, Scalar, Variance
 
 CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
@@ -211,7 +212,7 @@ class Frame(NamedTuple):
         Robust against fireflies and black backgrounds; 1 for a frame that is all
         black.
         """
-        return median_luminance(self.color)
+        return compiled(median_luminance)(self.color)
 
     def normalised(self, unit: Scalar | float | None = None) -> "Frame":
         """Return the frame with radiance divided by its median luminance.
@@ -231,9 +232,7 @@ class Frame(NamedTuple):
             if unit is not None:
                 raise ValueError("this frame is normalised already")
             return self
-        divisor = self.median_luminance if unit is None else jnp.asarray(unit)
-        divisor = divisor.astype(self.buffers.color.dtype)
-        return self.scaled(1 / divisor)._replace(unit=divisor)
+        return compiled(_normalised)(self, unit)
 
     def scaled(self, factor: Scalar | float) -> "Frame":
         """Return the frame with radiance multiplied by a factor.
@@ -284,6 +283,13 @@ class Frame(NamedTuple):
         if missing := needs.missing(self):
             kind = ImportError if missing == needs.missing_package() else ValueError
             raise kind(f"{who} needs {missing}")
+
+
+def _normalised(frame: Frame, unit: Scalar | float | None) -> Frame:
+    """The frame in a unit, or in its median luminance."""
+    divisor = frame.median_luminance if unit is None else jnp.asarray(unit)
+    divisor = divisor.astype(frame.buffers.color.dtype)
+    return frame.scaled(1 / divisor)._replace(unit=divisor)
 
 
 def _mean(buffer: Array | None) -> Image | None:
