@@ -11,7 +11,8 @@ A frame and its estimates are read, combined and written::
 
 Each paper is one package of pure functions: `james_stein`, `ensemble`,
 `double_shrinkage`, `progressive`, `uncorrelated`. Each has `combine` for arrays and
-`combine_frame` for frames. `methods` lists everything by name.
+`combine_frame` for frames. `methods` lists everything by name, and `guide` has pages on
+how to choose among them, on files, on large frames and on research.
 """
 
 from jscomb import (
@@ -21,12 +22,14 @@ from jscomb import (
     exr,
     features,
     frame,
+    guide,
     james_stein,
     learning,
     methods,
     metrics,
     numerics,
     progressive,
+    rendering,
     uncorrelated,
 )
 from jscomb.exr import read_frame
@@ -44,6 +47,7 @@ __all__ = [
     "exr",
     "features",
     "frame",
+    "guide",
     "james_stein",
     "learning",
     "make_frame",
@@ -52,6 +56,7 @@ __all__ = [
     "numerics",
     "progressive",
     "read_frame",
+    "rendering",
     "uncorrelated",
 ]
 

@@ -10,11 +10,17 @@ import jaxtyping
 import matplotlib as mpl
 import numpy as np
 import pytest
-from xdist.scheduler import LoadScopeScheduling
 
-from experiments import scenes
-from jscomb import cli, exr
+from jscomb import cli, exr, rendering
 from jscomb.frame import CHANNELS
+
+# Tests mostly wait for programs of small images to be compiled, so LLVM compiles them
+# without optimising. JAX reads this when it first compiles; processes inherit it.
+QUICK_COMPILATION = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_parallel_codegen_split_count=1"
+)
+os.environ["XLA_FLAGS"] = f"{QUICK_COMPILATION} {os.environ.get('XLA_FLAGS', '')}"
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -27,31 +33,22 @@ MAPPINGS = pathlib.Path("/proc/self/maps")
 _TESTS = itertools.count()
 
 
-_STATES: dict[str, dict] = {}
+def pytest_collection_modifyitems(items):
+    """Tests that share programs run in one process, which compiles them once.
+
+    Those of a file; in the battery those of a function, by their first parameter.
+    """
+    for item in items:
+        file, _, test = item.nodeid.partition("::")
+        first = test.partition("[")[2].partition("-")[0].rstrip("]")
+        group = f"{file} {first}" if "/battery/" in file else file
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
-class SharedPrograms(LoadScopeScheduling):
-    """Tests that share programs run in one process, which compiles them once."""
-
-    def _split_scope(self, nodeid):
-        """A file; in the battery over all functions, what the parameters begin with."""
-        file, _, test = nodeid.partition("::")
-        parameters = test.partition("[")[2].partition("-")[0].rstrip("]")
-        return f"{file} {parameters}" if file.endswith("test_common.py") else file
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    return SharedPrograms(config, log)
-
-
-@pytest.fixture(autouse=True)
-def same_numbers(request):
-    """What a module's `RNG` draws does not depend on which of its tests ran before."""
-    rng = getattr(request.module, "RNG", None)
-    if rng is not None:
-        generator = rng.bit_generator
-        generator.state = _STATES.setdefault(request.module.__name__, generator.state)
+@pytest.fixture
+def rng():
+    """A generator of its own for every test, so that none depends on others."""
+    return np.random.default_rng(0)
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +59,7 @@ def few_programs():
     """
     yield
     seldom = next(_TESTS) % 20 == 0  # to count takes a while
-    if seldom and MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > 30_000:
+    if seldom and MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > 45_000:
         jax.clear_caches()
 
 
@@ -94,7 +91,7 @@ def jscomb(monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def vectorised():
     """Mitsuba's LLVM variant, whatever other tests have set."""
-    mi = scenes.mitsuba()
+    mi = rendering.mitsuba()
     if not os.environ.get("DRJIT_LIBLLVM_PATH"):
         pytest.skip("needs LLVM 16 or newer")
     before = mi.variant()

@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from experiments import attack, hostile
 from jscomb.frame import make_frame
+from tests.exr_corpus import attack, hostile
 
 CONFIG = attack.Config(quick=True)
 

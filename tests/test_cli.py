@@ -5,10 +5,12 @@ import re
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
 from jscomb import exr, metrics
+from jscomb.cli import _showing
 from jscomb.cli._showing import SHOWN
 from jscomb.frame import Estimate
 from jscomb.methods import BASES, CANDIDATES, METHODS
@@ -25,21 +27,44 @@ def errors_in(text, column=0):
     return {name: float(values.split()[column]) for name, values in rows}
 
 
-def test_demo(jscomb, tmp_path):
-    status, out, _ = jscomb("demo", "--out", tmp_path / "demo")
+def demonstrate(jscomb, folder, shown=SHOWN):
+    """Run the demo; returns the errors at few and at many samples, by method."""
+    status, out, _ = jscomb("demo", "--out", folder)
     assert status == 0
     few, many = errors_in(out, 0), errors_in(out, 1)
-    methods = {"path tracing", "chosen", *SHOWN}
+    methods = {"path tracing", "chosen", *shown}
     assert few.keys() == many.keys() == methods
     assert all(many[name] < few[name] for name in methods)
-    assert few["chosen"] in [few[name] for name in SHOWN]
-    assert few["chosen"] < few["denoised"]
-    assert many["chosen"] < many["denoised"]
-    assert {p.name for p in (tmp_path / "demo").iterdir()} == {
+    assert few["chosen"] in [few[name] for name in shown]
+    assert {p.name for p in folder.iterdir()} == {
         "comparison.png",
-        *(f"cornell-glass-{n}-{m}.exr" for n in (64, 1024) for m in SHOWN),
+        *(f"cornell-glass-{n}-{m}.exr" for n in (64, 1024) for m in shown),
     }
-    assert os.fspath((tmp_path / "demo").resolve()) in out
+    assert os.fspath(folder.resolve()) in out
+    return few, many
+
+
+@pytest.mark.slow
+def test_demo(jscomb, tmp_path):
+    for errors in demonstrate(jscomb, tmp_path / "demo"):
+        assert errors["chosen"] < errors["denoised"]
+
+
+def test_demo_of_small_frames(jscomb, tmp_path, monkeypatch):
+    """The same of corners of crops of the frames, each timed once; no networks."""
+    corner = lambda i: i[..., :24, :24, :] if i.ndim > 2 else i
+    small = {}
+    for name in ("cornell-glass-64", "cornell-glass-1024"):
+        small[name] = tmp_path / f"{name}.exr"
+        frame = exr.read_frame(DATA / f"{name}.exr")
+        exr.write_frame(small[name], jax.tree.map(corner, frame))
+    monkeypatch.setattr(exr, "bundled", lambda: small)
+    monkeypatch.setattr(_showing, "TIMED_RUNS", 1)
+    monkeypatch.setattr(_showing, "SHOWN", SHOWN[:3])
+    monkeypatch.setattr(_showing, "choose", lambda *_: "whitened")
+    few, many = demonstrate(jscomb, tmp_path / "demo", SHOWN[:3])
+    assert few["chosen"] == few["whitened"] < few["denoised"]
+    assert many["chosen"] == many["whitened"] < many["denoised"]
 
 
 @pytest.mark.parametrize("method", ["auto", *SHOWN, "bilateral", "ensemble"])
@@ -165,7 +190,9 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
     color = glass_frame.buffers.color.at[:, 10:15, 10:15].set(np.nan)
     buffers = glass_frame.buffers._replace(color=color)
     exr.write_frame(tmp_path / "f.exr", glass_frame._replace(buffers=buffers))
-    status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
+    status, out, _ = jscomb(
+        "combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr", "--method", "whitened"
+    )
     assert status == 0
     assert "25 of 4096 pixels are not finite and were excluded" in out
     r, noise = glass_frame.reference
@@ -185,7 +212,7 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
         ),
         (["demo", "--nope"], "--nope"),
         (["frobnicate"], "frobnicate"),
-        ([], "demo, combine, compare, info"),
+        ([], "demo, render, combine, compare, info"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_too(jscomb, arguments, message):
@@ -196,7 +223,7 @@ def test_a_wrong_command_line_is_one_line_too(jscomb, arguments, message):
 
 
 def test_help_reads_well(jscomb):
-    for command in ((), ("demo",), ("combine",), ("compare",), ("info",)):
+    for command in ((), ("demo",), ("render",), ("combine",), ("compare",), ("info",)):
         status, out, _ = jscomb(*command, "--help")
         assert status == 0
         assert "usage: jscomb" in out

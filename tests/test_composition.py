@@ -34,7 +34,7 @@ def frame():
         samples=64,
     )
     halves = [half.color for half in made.halves()]
-    blur = lambda image: smoothing.gaussian(jnp.asarray(image), sigma=1.0)
+    blur = jax.jit(functools.partial(smoothing.gaussian, sigma=1.0))
     photons = [blur(truth) + 0.02 * rng.normal(size=truth.shape) for _ in range(2)]
     return (
         made.with_estimate(
@@ -52,8 +52,8 @@ MAKERS = {
     "blurred": functools.partial(smoothing.denoise_frame, sigma=1.0),
     "bilateral": functools.partial(bilateral.denoise_frame, window=5),
 }
-multi_scale = functools.partial(
-    ensemble.solve_weights, solver="multi-scale", windows=(7, 11)
+multi_scale = jax.jit(
+    functools.partial(ensemble.solve_weights, solver="multi-scale", windows=(7, 11))
 )
 mix = functools.partial(ensemble.combine_frame, windows=(7, 11))
 
@@ -72,6 +72,7 @@ def by_hand(frame, estimates):
     return [jnp.sum(weights * bases, axis=0) for bases in (full, a, b)]
 
 
+@jax.jit
 def whitened(color, biased, variance):
     """James-Stein as frames are combined."""
     v = james_stein.robust_variance(variance)
@@ -204,7 +205,7 @@ def test_compositions_jit_vmap_and_differentiate(name, frame):
     assert_same(jitted(frame), eager.image, *eager.halves)
     other = changed(frame, 0)
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), frame, other)
-    mapped = jax.vmap(compose)(both)
+    mapped = jax.jit(jax.vmap(compose))(both)
     for number, each in enumerate((frame, other)):
         expected = jitted(each)
         np.testing.assert_allclose(mapped.image[number], expected.image, rtol=1e-8)

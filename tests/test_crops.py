@@ -14,8 +14,7 @@ import pytest
 
 from jscomb.numerics import tiles
 from jscomb.numerics.windows import window_sum
-
-RNG = np.random.default_rng(0)
+from tests.conftest import QUICK_COMPILATION
 
 
 def blocks(image):
@@ -33,7 +32,8 @@ def blocks(image):
     st.sampled_from([3, 5, 9]),
 )
 def test_crops_are_the_whole(shape, tile, window):
-    image = jnp.asarray(RNG.normal(size=(*shape, 2)))
+    rng = np.random.default_rng(0)
+    image = jnp.asarray(rng.normal(size=(*shape, 2)))
     whole = window_sum(image, window)
     options = {"tile": tile, "halo": window // 2}
     local = lambda i: window_sum(i, window)
@@ -49,13 +49,14 @@ def test_crops_are_the_whole(shape, tile, window):
 @hypothesis.settings(max_examples=10, derandomize=True, deadline=None)
 @hypothesis.given(st.tuples(st.integers(1, 40), st.integers(1, 40)), st.integers(1, 30))
 def test_crops_keep_to_blocks(shape, tile):
-    image = jnp.asarray(RNG.normal(size=(*shape, 2)))
+    rng = np.random.default_rng(0)
+    image = jnp.asarray(rng.normal(size=(*shape, 2)))
     made = tiles.map_crops(blocks, image, tile=tile, halo=4, multiple=4)
     np.testing.assert_allclose(made, blocks(image), atol=1e-12)
 
 
-def test_gradients_go_through_crops():
-    image = jnp.asarray(RNG.normal(size=(9, 11, 1)))
+def test_gradients_go_through_crops(rng):
+    image = jnp.asarray(rng.normal(size=(9, 11, 1)))
     square = lambda f: lambda i: jnp.sum(jnp.square(f(i)))
     local = lambda i: window_sum(i, 5)
     by_crops = lambda i: tiles.map_crops(local, i, tile=4, halo=2)
@@ -126,7 +127,7 @@ def test_equal_options_share_one_program():
 
 def differences(*arguments, devices):
     """Start `on_devices` in a process that has so many devices."""
-    flags = f"--xla_force_host_platform_device_count={devices}"
+    flags = f"{QUICK_COMPILATION} --xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
         [sys.executable, "-m", "tests.on_devices", *arguments],
         env=os.environ | {"XLA_FLAGS": flags},

@@ -11,20 +11,19 @@ from jscomb.frame import Estimate, make_frame
 from tests.statistics import assert_mean
 from tests.test_regression import gaussian, oracle
 
-RNG = np.random.default_rng(1)
 cross = jax.jit(
     james_stein.cross_regression, static_argnames=("window", "stride", "fall_back")
 )
 
 
-def halves_of(size=(10, 11), extra=2):
+def halves_of(rng, size=(10, 11), extra=2):
     """x_a, x_b, y_a, y_b and other features of both, in float64."""
-    images = RNG.uniform(size=(4, *size, 3))
-    return [jnp.asarray(i) for i in (*images, *RNG.normal(size=(2, *size, extra)))]
+    images = rng.uniform(size=(4, *size, 3))
+    return [jnp.asarray(i) for i in (*images, *rng.normal(size=(2, *size, extra)))]
 
 
-def test_is_two_fits_that_fade_to_y():
-    xa, xb, ya, yb, fa, fb = map(np.asarray, halves_of())
+def test_is_two_fits_that_fade_to_y(rng):
+    xa, xb, ya, yb, fa, fb = map(np.asarray, halves_of(rng))
     bandwidth = 2 * 0.3 + 0.01
     found = cross(*map(jnp.asarray, (xa, xb, ya, yb, fa, fb)), window=5, kappa=0.3)
     for got, (x, guide, f) in zip(found, [(xa, yb, fb), (xb, ya, fa)], strict=True):
@@ -56,8 +55,8 @@ def test_a_pixel_alone_keeps_its_radiance_at_any_stride():
 
 
 @pytest.mark.parametrize("robust", [True, False])
-def test_guide_noise(robust):
-    a, b = RNG.normal(size=(2, 7, 7, 3))
+def test_guide_noise(robust, rng):
+    a, b = rng.normal(size=(2, 7, 7, 3))
     square = ((a - b) ** 2).sum(-1) / 2
     a[2, 3, 1] = np.nan
     square = np.delete(square.ravel(), 2 * 7 + 3)
@@ -72,9 +71,9 @@ def test_guide_noise(robust):
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_a_bad_pixel_stays_local(stride):
+def test_a_bad_pixel_stays_local(stride, rng):
     """It takes no part, and becomes the first finite of y and x."""
-    good = halves_of((24, 24))
+    good = halves_of(rng, (24, 24))
     options = {"window": 5, "stride": stride, "kappa": 0.1}
     total = lambda *i: sum(jnp.sum(c) for c in cross(*i, **options))
     gradient = jax.jit(jax.grad(total, argnums=tuple(range(6))))
@@ -96,8 +95,8 @@ def test_a_bad_pixel_stays_local(stride):
             np.testing.assert_allclose(bare[which][6, 7], expected[6, 7], rtol=1e-12)
 
 
-def test_the_decision_has_derivatives_where_the_variance_is_zero():
-    *images, v = *halves_of((8, 8)), jnp.zeros((8, 8, 3))
+def test_the_decision_has_derivatives_where_the_variance_is_zero(rng):
+    *images, v = *halves_of(rng, (8, 8)), jnp.zeros((8, 8, 3))
     worth = lambda v: james_stein.worth_regressing(
         jax.random.key(0), *images, v, v, window=5, stride=1
     )
@@ -105,18 +104,18 @@ def test_the_decision_has_derivatives_where_the_variance_is_zero():
     assert np.isfinite([*change, *slope]).all()
 
 
-def test_gradients():
-    images = halves_of((5, 6), extra=1)
+def test_gradients(rng):
+    images = halves_of(rng, (5, 6), extra=1)
     regress = jax.jit(lambda *i: james_stein.cross_regression(*i, window=5, kappa=0.2))
     check_grads(regress, tuple(images), order=1, modes=["rev"], rtol=1e-5)
 
 
-def test_the_estimated_change_is_unbiased():
+def test_the_estimated_change_is_unbiased(rng):
     """Against the true change, over many noises; y and the guide are denoised x."""
     size, runs = (14, 14), 400
-    truth = jnp.asarray(RNG.uniform(0.5, 1.5, (*size, 1)))
-    variance = jnp.asarray(RNG.uniform(0.005, 0.02, (*size, 1)))
-    f = jnp.asarray(RNG.normal(size=(*size, 1)))
+    truth = jnp.asarray(rng.uniform(0.5, 1.5, (*size, 1)))
+    variance = jnp.asarray(rng.uniform(0.005, 0.02, (*size, 1)))
+    f = jnp.asarray(rng.normal(size=(*size, 1)))
     blur = lambda i: (i + jnp.roll(i, 1, 0) + jnp.roll(i, 1, 1)) / 3
 
     def run(key):
@@ -139,9 +138,9 @@ def test_the_estimated_change_is_unbiased():
     assert_mean(estimates - true, 0.0)
 
 
-def test_constant_and_equal_features_leave_without_a_trace():
+def test_constant_and_equal_features_leave_without_a_trace(rng):
     """The result is that of all features, to rounding."""
-    images = halves_of((12, 13), extra=2)
+    images = halves_of(rng, (12, 13), extra=2)
     *four, fa, fb = images
     more = [
         jnp.concatenate([f, jnp.full_like(f[..., :1], 3.0), f[..., :1]], -1)
@@ -168,11 +167,11 @@ def test_features_of_a_frame():
     assert features.select(one_differs).channels == (0,)
 
 
-def textured(noise):
+def textured(rng, noise):
     """A frame whose albedo explains its radiance, and a blurred image of it."""
-    albedo = RNG.uniform(0.2, 1, (40, 40, 3))
-    a, b = albedo + noise * RNG.normal(size=(2, 40, 40, 3))
-    blurred = np.full((2, 40, 40, 3), albedo.mean()) + 0.01 * RNG.normal(
+    albedo = rng.uniform(0.2, 1, (40, 40, 3))
+    a, b = albedo + noise * rng.normal(size=(2, 40, 40, 3))
+    blurred = np.full((2, 40, 40, 3), albedo.mean()) + 0.01 * rng.normal(
         size=(2, 40, 40, 3)
     )
     frame = make_frame(
@@ -192,8 +191,8 @@ def regress(frame, name="blurred", *, window=9):
     return james_stein.regress(jax.random.key(0), frame, y, window=window)
 
 
-def test_regresses_where_features_explain_the_radiance():
-    frame = textured(0.1).normalised()
+def test_regresses_where_features_explain_the_radiance(rng):
+    frame = textured(rng, 0.1).normalised()
     done = regress(frame)
     assert done.ran
     error = lambda image: float(jnp.mean((image - frame.reference.image) ** 2))
@@ -202,8 +201,8 @@ def test_regresses_where_features_explain_the_radiance():
     assert done.estimate.halves.shape == (2, 40, 40, 3)
 
 
-def test_leaves_a_perfect_image_alone():
-    frame = textured(0.3)
+def test_leaves_a_perfect_image_alone(rng):
+    frame = textured(rng, 0.3)
     truth = frame.reference.image
     frame = frame.with_estimate("truth", Estimate(truth, jnp.stack([truth, truth])))
     frame = frame.normalised()
@@ -213,8 +212,8 @@ def test_leaves_a_perfect_image_alone():
     assert done.change.mean > 0
 
 
-def test_regress_is_scale_equivariant():
-    frame = textured(0.1)
+def test_regress_is_scale_equivariant(rng):
+    frame = textured(rng, 0.1)
     one = regress(frame.normalised())
     for scale in (1e-4, 1e5):
         other = regress(frame.scaled(scale).normalised())
@@ -222,22 +221,22 @@ def test_regress_is_scale_equivariant():
         np.testing.assert_allclose(other.change.mean, one.change.mean, rtol=1e-6)
 
 
-def test_regress_with_few_features_and_narrow_windows():
-    frame = textured(0.1)
+def test_regress_with_few_features_and_narrow_windows(rng):
+    frame = textured(rng, 0.1)
     bare = frame._replace(buffers=frame.buffers._replace(albedo=None))
     done = regress(bare.normalised(), window=3)
     assert np.isfinite(done.change.mean)
 
 
-def test_regress_without_given_variance():
-    frame = textured(0.1)
+def test_regress_without_given_variance(rng):
+    frame = textured(rng, 0.1)
     frame = frame._replace(buffers=frame.buffers._replace(variance=None))
     assert regress(frame.normalised()).ran
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_bad_input():
-    images = halves_of()
+def test_bad_input(rng):
+    images = halves_of(rng)
     with pytest.raises(ValueError, match="biased_b has shape"):
         james_stein.cross_regression(*images[:3], images[3][:5], *images[4:])
     with pytest.raises(ValueError, match=r"features_b has shape \(10, 11, 1\)"):
@@ -246,7 +245,7 @@ def test_bad_input():
         james_stein.worth_regressing(
             jax.random.key(0), *images[:5], images[5][:9], *images[:2]
         )
-    frame = textured(0.1)
+    frame = textured(rng, 0.1)
     with pytest.raises(ValueError, match=r"regress needs a normalised frame: call"):
         regress(frame)
     without = frame.with_estimate("blurred", frame.color).normalised()

@@ -13,9 +13,11 @@ from jscomb.numerics import simplex
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from tests.statistics import assert_mean, assert_mean_below
 
-RNG = np.random.default_rng(4)
 OURS = {"solver": "multi-scale", "filter": False}
 combine = jax.jit(ensemble.combine, static_argnames=("solver", "filter", "windows"))
+error_matrix = jax.jit(
+    ensemble.error_matrix, static_argnames=("windows", "whole_frame", "shared")
+)
 
 
 def bases_of(image):
@@ -29,6 +31,7 @@ def bases_of(image):
     )
 
 
+@jax.jit
 def rendering(key, truth, noise):
     """Halves, and bases of the full image and of both halves."""
     a, b = truth[None] + noise * jax.random.normal(key, (2, *truth.shape), truth.dtype)
@@ -72,11 +75,11 @@ def test_the_matrix_is_unbiased_for_that_of_halves(many, truth):
 def test_with_the_true_matrix_no_base_is_better(many, truth):
     full, _, _ = many
     matrix = ensemble.true_matrix(full, truth)
-    weights = simplex.quadratic(matrix)
+    weights = jax.jit(simplex.quadratic)(matrix)
     error = jnp.sum(weights[:, None] * weights[None] * matrix, axis=(0, 1))
     single = jnp.stack([matrix[i, i] for i in range(3)])
     assert (error <= single.min(axis=0) * (1 + 1e-9)).all()
-    combined = jax.vmap(ensemble.average, in_axes=(0, None))(full, weights)
+    combined = jax.jit(jax.vmap(ensemble.average, in_axes=(0, None)))(full, weights)
     measured = jnp.mean((combined - truth[None]) ** 2)
     np.testing.assert_allclose(measured, error.mean(), rtol=1e-9)
     assert measured < 0.9 * single.mean(axis=(1, 2, 3)).min()
@@ -111,35 +114,34 @@ def test_consistent_if_one_base_is(truth, solver):
     assert errors[2] < 0.1 * errors[1] < 0.1 * errors[0]
 
 
-def test_multi_scale_is_between_its_scales(truth):
+def test_multi_scale_is_between_its_scales(truth, rng):
     """Pure noise leaves the frame's matrix; what both halves agree on is kept."""
     images = rendering(jax.random.key(3), truth, 0.5)[1:]
-    frame = ensemble.error_matrix(*images, windows=())
+    frame = error_matrix(*images, windows=())
     assert frame.shape == (3, 3, 24, 26, 1)
     assert float(jnp.ptp(frame, axis=(2, 3)).max()) < 1e-12
     same = rendering(jax.random.key(3), truth, 0.0)[1:]
-    multi = ensemble.error_matrix(*same, windows=(7, 15))
-    local = ensemble.error_matrix(*same, windows=(7,), whole_frame=False)
+    multi = error_matrix(*same, windows=(7, 15))
+    local = error_matrix(*same, windows=(7,), whole_frame=False)
     np.testing.assert_allclose(multi, local, atol=1e-12)
-    noise = [jnp.asarray(RNG.normal(size=(3, 64, 64, 1))) for _ in range(2)]
+    noise = [jnp.asarray(rng.normal(size=(3, 64, 64, 1))) for _ in range(2)]
     flat = jnp.ones((64, 64, 1)) + 0.1 * noise[0][0], jnp.ones((64, 64, 1))
     bases = [1 + 0.1 * i for i in noise]
     spread = lambda matrix: float(jnp.std(matrix[0, 0]))
-    shrunk = ensemble.error_matrix(*bases, *flat, windows=(7, 15))
-    plain = ensemble.error_matrix(*bases, *flat, windows=(7,), whole_frame=False)
+    shrunk = error_matrix(*bases, *flat, windows=(7, 15))
+    plain = error_matrix(*bases, *flat, windows=(7,), whole_frame=False)
     assert spread(shrunk) < 0.5 * spread(plain)
 
 
 def test_shared_or_each_channel():
     images = rendering(jax.random.key(4), jnp.ones((9, 10, 3)), 0.1)[1:]
-    matrix = jax.jit(ensemble.error_matrix, static_argnames=("windows", "shared"))
-    each = matrix(*images, windows=(7,), shared=False)
+    each = error_matrix(*images, windows=(7,), shared=False)
     assert each.shape == (3, 3, 9, 10, 3)
-    assert matrix(*images, windows=(7,)).shape == (3, 3, 9, 10, 1)
+    assert error_matrix(*images, windows=(7,)).shape == (3, 3, 9, 10, 1)
     one_channel = [i[..., :1] for i in images]
     np.testing.assert_allclose(
-        matrix(*one_channel, windows=(7,), shared=False),
-        matrix(*one_channel, windows=(7,)),
+        error_matrix(*one_channel, windows=(7,), shared=False),
+        error_matrix(*one_channel, windows=(7,)),
         rtol=1e-10,
     )
 
@@ -171,9 +173,9 @@ def bilateral_by_loops(image, guide, noisy, variance, window, sigma):
 
 
 @pytest.mark.parametrize("size", [(9, 12), (1, 1), (1, 7)])
-def test_the_filter_is_the_loops(size):
-    image, noisy = RNG.normal(size=(2, *size, 2))
-    guide, variance = RNG.normal(size=(*size, 3)), RNG.uniform(0, 1, (*size, 2))
+def test_the_filter_is_the_loops(size, rng):
+    image, noisy = rng.normal(size=(2, *size, 2))
+    guide, variance = rng.normal(size=(*size, 3)), rng.uniform(0, 1, (*size, 2))
     variance[0, 0] = 0
     if size == (9, 12):
         noisy[4, 5, 0], guide[2, 2, 1] = np.nan, np.inf
@@ -193,9 +195,9 @@ def test_the_filter_is_the_loops(size):
         assert np.isfinite(gradient).all()
 
 
-def test_the_filter_is_as_exact_far_from_the_origin():
+def test_the_filter_is_as_exact_far_from_the_origin(rng):
     """Where scaled coordinates would be rounded, in float32."""
-    image, guide = jnp.asarray(RNG.normal(size=(2, 3, 5000, 1)), jnp.float32)
+    image, guide = jnp.asarray(rng.normal(size=(2, 3, 5000, 1)), jnp.float32)
 
     @jax.jit
     def filtered(image, guide):
@@ -207,9 +209,9 @@ def test_the_filter_is_as_exact_far_from_the_origin():
     np.testing.assert_allclose(far[:, 2:], crop[:, 2:], atol=2e-6)
 
 
-def test_filtered_weights_stay_weights(glass_frame):
+def test_filtered_weights_stay_weights(glass_frame, rng):
     color, albedo, normal = glass_frame.color, glass_frame.albedo, glass_frame.normal
-    w = RNG.dirichlet(np.ones(3), color.shape)
+    w = rng.dirichlet(np.ones(3), color.shape)
     w = jnp.asarray(np.moveaxis(w, -1, 0), jnp.float32)
     smooth = jax.jit(ensemble.filter_weights)
     out = smooth(w, color, glass_frame.variance, albedo=albedo, normal=normal)

@@ -9,8 +9,6 @@ from jax.test_util import check_grads
 from jscomb.numerics.kernels import Kernels, kernel_mean, predicted_mean
 from jscomb.numerics.tiles import map_rows
 
-RNG = np.random.default_rng(8)
-
 
 def identity(weights, reach=1):
     """Kernels whose head returns its features, less the rows around the strip."""
@@ -19,31 +17,38 @@ def identity(weights, reach=1):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (16, 4), (37, 9)])
 @pytest.mark.parametrize("reach", [0, 1])
-def test_predicted_is_given_a_strip_at_a_time(shape, reach):
-    images = jnp.asarray(RNG.random((2, *shape, 3)))
-    weights = jnp.asarray(RNG.random((*shape, 2 * 25)))
-    mask = jnp.asarray(RNG.random((*shape, 1)) < 0.8)
-    found = predicted_mean(images, identity(weights, reach), 5, mask=mask)
-    halves = jnp.split(weights, 2, axis=-1)
-    for k, half in enumerate(halves):
-        expected = kernel_mean(images[k], half, 5, mask=mask)
-        np.testing.assert_allclose(found[k], expected, rtol=1e-12)
+def test_predicted_is_given_a_strip_at_a_time(shape, reach, rng):
+    images = jnp.asarray(rng.random((2, *shape, 3)))
+    weights = jnp.asarray(rng.random((*shape, 2 * 25)))
+    mask = jnp.asarray(rng.random((*shape, 1)) < 0.8)
+
+    @jax.jit
+    def both(images, weights, mask):
+        at_once = [
+            kernel_mean(image, half, 5, mask=mask)
+            for image, half in zip(images, jnp.split(weights, 2, axis=-1), strict=True)
+        ]
+        return predicted_mean(images, identity(weights, reach), 5, mask=mask), at_once
+
+    for found, expected in zip(*both(images, weights, mask), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_predicted_differentiates_in_both_modes():
-    images, weights = jnp.asarray(RNG.random((1, 20, 4, 2))), RNG.random((20, 4, 9))
+def test_predicted_differentiates_in_both_modes(rng):
+    images, weights = jnp.asarray(rng.random((1, 20, 4, 2))), rng.random((20, 4, 9))
     mean = lambda i, w: predicted_mean(i, identity(w), 3)
     check_grads(jax.jit(mean), (images, jnp.asarray(weights)), order=1)
 
 
-def test_masked_pixels_are_excluded():
-    images = jnp.asarray(RNG.random((1, 20, 4, 2))).at[0, 3, 1].set(jnp.nan)
+def test_masked_pixels_are_excluded(rng):
+    images = jnp.asarray(rng.random((1, 20, 4, 2))).at[0, 3, 1].set(jnp.nan)
     weights, mask = (
-        jnp.asarray(RNG.random((20, 4, 9))),
+        jnp.asarray(rng.random((20, 4, 9))),
         jnp.isfinite(images[0, ..., :1]),
     )
     total = lambda i, w: predicted_mean(i, identity(w), 3, mask=mask).sum()
-    value, gradients = jax.value_and_grad(total, (0, 1))(images, weights)
+    run = jax.jit(jax.value_and_grad(total, (0, 1)))
+    value, gradients = run(images, weights)
     assert np.isfinite(value)
     assert all(np.isfinite(g).all() for g in gradients)
     assert not gradients[0][0, 3, 1].any()
@@ -69,8 +74,8 @@ def test_memory_does_not_hold_all_weights():
 
 
 @pytest.mark.parametrize("height", [1, 15, 16, 17, 40])
-def test_strips_of_rows_are_the_image(height):
-    image, other = (jnp.asarray(RNG.random((height, 3, c))) for c in (2, 1))
+def test_strips_of_rows_are_the_image(height, rng):
+    image, other = (jnp.asarray(rng.random((height, 3, c))) for c in (2, 1))
 
     def shifted(near, strip):
         """The pixel two rows above and the one three rows below."""

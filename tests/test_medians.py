@@ -10,8 +10,6 @@ from hypothesis.extra import numpy as arrays
 
 from jscomb.numerics.medians import median, median_of
 
-RNG = np.random.default_rng(0)
-
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @settings(deadline=None)  # the first example compiles
@@ -30,8 +28,8 @@ def test_the_median_is_that_of_the_valid_values(kind, data):
 
 
 @pytest.mark.parametrize("count", [10, 11])
-def test_the_derivative_is_that_of_the_values_in_the_middle(count):
-    values = jnp.asarray(RNG.uniform(0, 1, count))
+def test_the_derivative_is_that_of_the_values_in_the_middle(count, rng):
+    values = jnp.asarray(rng.uniform(0, 1, count))
     gradient = jax.grad(median)(values, jnp.ones(count, bool))
     np.testing.assert_allclose(gradient, jax.grad(jnp.median)(values))
 
@@ -43,7 +41,7 @@ def test_equal_values_share_the_derivative():
 
 
 @pytest.mark.parametrize("count", range(1, 8))
-def test_the_median_of_images(count):
-    images = RNG.normal(size=(count, 50, 3)).round(1)
+def test_the_median_of_images(count, rng):
+    images = rng.normal(size=(count, 50, 3)).round(1)
     found = median_of(jnp.asarray(images))
     np.testing.assert_allclose(found, np.median(images, axis=0), rtol=1e-15)

@@ -14,8 +14,6 @@ from jscomb.numerics.kernels import Kernels
 from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.sure import monte_carlo_sure
 
-RNG = np.random.default_rng(3)
-
 
 def key():
     """Return the same key, as if unused."""
@@ -27,36 +25,39 @@ def parameters_of(network) -> int:
     return sum(p.size for p in jax.tree.leaves(network))
 
 
-def random_convolution(size=3, inputs=2, outputs=3):
+def random_convolution(rng, size=3, inputs=2, outputs=3):
     """Return a convolution with a bias, in float64."""
     convolution = networks.Convolution(key(), inputs, outputs, size=size)
-    draw = lambda leaf: jnp.asarray(RNG.normal(size=leaf.shape))
+    draw = lambda leaf: jnp.asarray(rng.normal(size=leaf.shape))
     return jax.tree.map(draw, convolution)
 
 
 @pytest.mark.parametrize("size", [1, 3, 5])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 6), (17, 4)])
-def test_convolution_matches_loops(size, shape):
-    convolution, r = random_convolution(size), size // 2
-    image = RNG.normal(size=(*shape, 2))
+def test_convolution_matches_loops(size, shape, rng):
+    convolution, r = random_convolution(rng, size), size // 2
+    image = rng.normal(size=(*shape, 2))
     kernel, bias = (np.asarray(p[...]) for p in (convolution.kernel, convolution.bias))
     padded = np.pad(image, ((r, r), (r, r), (0, 0)))
     wanted = np.zeros((*shape, 3))
     for i, j in np.ndindex(*shape):
         near = padded[i : i + size, j : j + size]
         wanted[i, j] = np.einsum("ijc,ijcd->d", near, kernel) + bias
-    found = convolution(jnp.asarray(image))
-    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+    run = jax.jit(
+        lambda image, inner: convolution(image, inner=inner), static_argnums=1
+    )
+    np.testing.assert_allclose(run(image, False), wanted, rtol=1e-12, atol=1e-12)
     if shape[0] > 2 * r:
-        inner = convolution(jnp.asarray(image), inner=True)
-        np.testing.assert_allclose(inner, wanted[r : shape[0] - r], atol=1e-12)
+        np.testing.assert_allclose(
+            run(image, True), wanted[r : shape[0] - r], atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("size", [1, 3, 5])
-def test_convolution_derivatives(size):
+def test_convolution_derivatives(size, rng):
     """Our derivative in the kernel equals XLA's, under vmap and in both modes."""
-    convolution = random_convolution(size)
-    images = jnp.asarray(RNG.normal(size=(4, 19, 6, 2)))
+    convolution = random_convolution(rng, size)
+    images = jnp.asarray(rng.normal(size=(4, 19, 6, 2)))
 
     def ours(convolution, images):
         return jnp.sum(jnp.sin(jax.vmap(convolution)(images)))
@@ -72,7 +73,7 @@ def test_convolution_derivatives(size):
     at = convolution, images
     for found, wanted in zip(
         jax.tree.leaves(jax.jit(jax.grad(ours, (0, 1)))(*at)),
-        jax.tree.leaves(jax.grad(xla, (0, 1))(*at)),
+        jax.tree.leaves(jax.jit(jax.grad(xla, (0, 1)))(*at)),
         strict=True,
     ):
         np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-12)
@@ -80,22 +81,22 @@ def test_convolution_derivatives(size):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (4, 8), (5, 7), (9, 1)])
-def test_unet_of_any_size(shape):
+def test_unet_of_any_size(shape, rng):
     """An image that is not whole blocks is padded with zeros."""
-    net = networks.UNet(key(), 2, size="light")
-    image = jnp.asarray(RNG.random((*shape, 2)))
+    network = networks.UNet(key(), 2, size="light")
+    net = jax.jit(lambda image: network(image))
+    image = rng.random((*shape, 2))
     out = net(image)
     assert out.shape == (*shape, 16)
-    block = jnp.zeros((12, 12, 2)).at[: shape[0], : shape[1]].set(image)
-    need = [-(-n // 4) * 4 for n in shape]
-    padded = net(block[: need[0], : need[1]])
+    pad = [(0, -n % 4) for n in shape]
+    padded = net(np.pad(image, [*pad, (0, 0)]))
     np.testing.assert_allclose(out, padded[: shape[0], : shape[1]], rtol=1e-12)
 
 
-def transparent(network):
+def transparent(rng, network):
     """The network in float64 with positive weights, so that no ReLU blocks a signal."""
     draw = lambda p: jnp.asarray(
-        RNG.uniform(0.5, 1.5, p.shape) / max(p[..., 0].size, 1)
+        rng.uniform(0.5, 1.5, p.shape) / max(p[..., 0].size, 1)
     )
     weights = lambda p: draw(p) if p.ndim == 4 else jnp.zeros(p.shape)
     return jax.tree.map(weights, network)
@@ -141,14 +142,14 @@ REACHES = {
 
 
 @pytest.mark.parametrize("name", REACHES)
-def test_reach_is_exact(name):
+def test_reach_is_exact(name, rng):
     """A pixel changes outputs as far as the reach, and none beyond.
 
     Wherever it is in a block; it is the only one that is not black, so that it is the
     maximum wherever it is pooled.
     """
     make, of = REACHES[name]
-    network = transparent(make())
+    network = transparent(rng, make())
     multiple, reach = network.multiple, network.reach
     start = multiple * (reach // multiple + 1)
     black = jnp.zeros((2 * start + multiple, 2 * start + multiple, 3))
@@ -199,9 +200,13 @@ def test_equal_weights_are_the_estimator_without_a_network(images):
     def network(x, v, a, b):
         return james_stein.Parameters(equal(x), jnp.full_like(x[..., :1], 0.25))
 
-    found = james_stein.neural_combine(network, x, a, b, v)
-    pooled = james_stein.smooth_variance(v, window=15)
-    wanted = james_stein.combine(x, 0.25 * a + 0.75 * b, pooled)
+    @jax.jit
+    def both(x, a, b, v):
+        pooled = james_stein.smooth_variance(v, window=15)
+        wanted = james_stein.combine(x, 0.25 * a + 0.75 * b, pooled)
+        return james_stein.neural_combine(network, x, a, b, v), wanted
+
+    found, wanted = both(x, a, b, v)
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
@@ -276,7 +281,8 @@ def neural(request):
 
 def hard_cases():
     """Return x, y and variance that break careless programs."""
-    x, y, v = RNG.random((3, 12, 13, 3)).astype(np.float32)
+    rng = np.random.default_rng(3)
+    x, y, v = rng.random((3, 12, 13, 3)).astype(np.float32)
     firefly = x.copy()
     firefly[4, 5] = 1e6
     certain = np.zeros_like(v)
@@ -307,9 +313,9 @@ def test_finite_at_hard_cases(neural, case):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (9, 2)])
-def test_any_size(neural, size):
+def test_any_size(neural, size, rng):
     network, combine, _ = neural
-    images = [jnp.asarray(RNG.random((*size, 3)), jnp.float32) for _ in range(3)]
+    images = [jnp.asarray(rng.random((*size, 3)), jnp.float32) for _ in range(3)]
     out = combine(network, *images)
     assert out.shape == (*size, 3)
     assert np.isfinite(out).all()
@@ -332,11 +338,15 @@ def test_scale_equivariant(neural, scale, glass_frame):
 
 def test_gradients_reach_every_parameter(neural, glass_frame):
     network, _, gradient = neural
-    images = (
-        glass_frame.color,
-        glass_frame.estimates["oidn"].image,
-        glass_frame.variance,
-    )
+    # Of the size of the hard cases, so that it is their program.
+    images = [
+        i[26:38, 20:33]
+        for i in (
+            glass_frame.color,
+            glass_frame.estimates["oidn"].image,
+            glass_frame.variance,
+        )
+    ]
     _, (of_network, *_) = gradient(network, *images)
     for leaf in jax.tree.leaves(of_network):
         assert np.any(np.asarray(leaf) != 0)
@@ -352,8 +362,10 @@ def test_sure_of_a_network(glass_frame):
             [glass_frame.albedo, glass_frame.normal, glass_frame.depth], axis=-1
         )
     )
-    denoise = lambda x: kernel_predicting.denoise_normalised(network, x, v, features)
-    found = monte_carlo_sure(key(), denoise, x, v)
+    denoise = jax.jit(
+        lambda x: kernel_predicting.denoise_normalised(network, x, v, features)
+    )
+    found = jax.jit(lambda x, v: monte_carlo_sure(key(), denoise, x, v))(x, v)
     deviation = jnp.sqrt(v) * jax.random.rademacher(
         jax.random.split(key())[0], x.shape, x.dtype
     )

@@ -12,7 +12,6 @@ from jscomb.frame import make_frame
 from jscomb.metrics import rel_l2
 from tests.conftest import DATA
 
-RNG = np.random.default_rng(2)
 SIZES = {"window": 7, "patch": 3}
 means = jax.jit(nonlocal_means.denoise, static_argnames=("window", "patch", "strength"))
 
@@ -58,17 +57,17 @@ def means_by_loops(image, u, v, f=None, *, window, patch, strength):
     return result
 
 
-def noisy(height=11, width=19):
+def noisy(rng, height=9, width=11):
     """Image, guide and its variance; one pixel without variance."""
-    image, u = RNG.uniform(size=(2, height, width, 2))
-    v = RNG.uniform(0.01, 0.1, (height, width, 2))
+    image, u = rng.uniform(size=(2, height, width, 2))
+    v = rng.uniform(0.01, 0.1, (height, width, 2))
     v[3, 0] = 0
     return image, u, v
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_non_local_means_are_the_loops(broken):
-    data = noisy()
+def test_non_local_means_are_the_loops(broken, rng):
+    data = noisy(rng)
     if broken:
         for k, bad in enumerate((np.nan, np.inf, np.nan)):
             data[k][2 + 3 * k, 4, 0] = bad
@@ -83,8 +82,8 @@ def test_non_local_means_are_the_loops(broken):
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_rdfc_is_the_loops(broken):
-    data = (*noisy(), np.add.outer(np.arange(11), np.arange(19) % 7)[..., None] / 10)
+def test_rdfc_is_the_loops(broken, rng):
+    data = (*noisy(rng), np.add.outer(np.arange(9), np.arange(11) % 7)[..., None] / 10)
     if broken:
         data[3][4, 9], data[0][6, 3, 1] = np.nan, np.inf
     expected = means_by_loops(*data, **SIZES, strength=0.7)
@@ -125,8 +124,8 @@ def test_rdfc_keeps_apart_what_the_noise_hides():
     assert float(jnp.abs(means(side, guide, variance, **SIZES) - side).max()) > 0.4
 
 
-def test_non_local_means_gradient():
-    data = [jnp.asarray(i[:5, :6]) for i in noisy()]
+def test_non_local_means_gradient(rng):
+    data = [jnp.asarray(i[:5, :6]) for i in noisy(rng)]
     data[2] = data[2] + 0.01
     # Short steps: each of the many pairs has a kink where its patches are alike.
     check_grads(
@@ -134,10 +133,10 @@ def test_non_local_means_gradient():
     )
 
 
-def test_non_local_means_keep_an_edge_and_clear_the_rest():
+def test_non_local_means_keep_an_edge_and_clear_the_rest(rng):
     truth = np.zeros((24, 24, 1))
     truth[:, 12:] = 1
-    image = jnp.asarray(truth + 0.1 * RNG.normal(size=truth.shape))
+    image = jnp.asarray(truth + 0.1 * rng.normal(size=truth.shape))
     variance = jnp.full_like(image, 0.01)
     error = lambda i: float(jnp.mean((i - truth) ** 2))
     assert error(means(image, image, variance)) < 0.1 * error(image)
@@ -156,17 +155,24 @@ def test_nfor_lowers_the_error_of_a_real_frame():
     denoised = nfor.denoise_frame(box_frame)
     assert error(denoised.image) < 0.3 * error(box_frame.color)
     assert error(denoised.halves[0]) < 0.3 * error(box_frame.halves()[0].color)
+
+
+def test_nfor_is_scale_equivariant(glass_frame):
+    corner = lambda i: i[..., :24, :24, :] if i.ndim > 2 else i
+    frame = jax.tree.map(corner, glass_frame).merged(2)
+    run = lambda frame: nfor.denoise_frame(frame, window=9).image
+    one = run(frame)
     for scale in (1e-6, 1e6):
-        other = nfor.denoise_frame(box_frame.scaled(scale)).image / scale
-        np.testing.assert_allclose(other, denoised.image, rtol=1e-3, atol=1e-5)
+        other = run(frame.scaled(scale)) / scale
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-5)
 
 
-def test_nfor_is_consistent():
+def test_nfor_is_consistent(rng):
     """With ever less noise its error vanishes, even where features explain nothing."""
-    truth = RNG.uniform(0.5, 1.5, (20, 20, 3))
+    truth = rng.uniform(0.5, 1.5, (20, 20, 3))
     errors = []
     for noise in (0.1, 0.01):
-        a, b = truth + noise * RNG.normal(size=(2, 20, 20, 3))
+        a, b = truth + noise * rng.normal(size=(2, 20, 20, 3))
         variance = jnp.full((20, 20, 3), noise**2)
         none = jnp.zeros((20, 20, 0))
         run = jax.jit(lambda *i: nfor.denoise(*i, window=7, patch=3))
@@ -175,7 +181,7 @@ def test_nfor_is_consistent():
     assert errors[1] < 0.02 * errors[0]
 
 
-def test_a_pixel_unlike_in_one_channel_is_kept():
+def test_a_pixel_unlike_in_one_channel_is_kept(rng):
     """However few of a patch's values differ, if they do so beyond the noise."""
     image = np.full((14, 14, 3), 0.5)
     image[6, 7, 0] = 5
@@ -183,16 +189,16 @@ def test_a_pixel_unlike_in_one_channel_is_kept():
     f[6, 7, 2] = 1
     filtered, _ = jax.jit(nfor.filter_features)(jnp.asarray(f), jnp.asarray(f))
     np.testing.assert_allclose(filtered, f, atol=1e-6)
-    a, b = image + 1e-3 * RNG.normal(size=(2, *image.shape))
+    a, b = image + 1e-3 * rng.normal(size=(2, *image.shape))
     v, none = jnp.full_like(image, 1e-6), jnp.zeros((14, 14, 0))
     run = jax.jit(lambda a, b: nfor.denoise(a, b, v, v, none, none, window=7))
     pair = run(jnp.asarray(a), jnp.asarray(b))
     np.testing.assert_allclose((pair[0] + pair[1]) / 2, image, atol=0.02)
 
 
-def test_nfor_of_a_bare_frame():
+def test_nfor_of_a_bare_frame(rng):
     """No features; halves as soon as each has what it needs; one bad pixel."""
-    color = RNG.uniform(0.5, 1, (8, 9, 10, 3))
+    color = rng.uniform(0.5, 1, (8, 9, 10, 3))
     color[0, 4, 4] = np.nan
     run = lambda frame: nfor.denoise_frame(frame, window=3)
     eight = run(make_frame(color))
@@ -214,8 +220,8 @@ def test_nfor_of_a_bare_frame():
         (8, True, True),
     ],
 )
-def test_nfor_has_halves_where_each_is_a_frame_for_it(buffers, given, halves):
-    color = RNG.uniform(0.5, 1, (buffers, 5, 6, 3))
+def test_nfor_has_halves_where_each_is_a_frame_for_it(buffers, given, halves, rng):
+    color = rng.uniform(0.5, 1, (buffers, 5, 6, 3))
     variance = jnp.full(color.shape, 0.01) if given else None
     frame = make_frame(color, variance=variance)
     made = nfor.denoise_frame(frame, window=3)
@@ -280,10 +286,10 @@ LOCAL = {
 
 
 @pytest.mark.parametrize("name", LOCAL)
-def test_reach_is_exact(name):
+def test_reach_is_exact(name, rng):
     """One pixel's change is seen at that distance, and nowhere beyond."""
     denoise, reach, reaches = LOCAL[name]
-    near = jnp.asarray(RNG.uniform(1, 1.1, (2, 17, 17, 2)))
+    near = jnp.asarray(rng.uniform(1, 1.1, (2, 17, 17, 2)))
     images = near[0], 5e-4 * near[1], 0.6 * near[1]
     assert reach == max(r for r in reaches if r is not None)
     for k, own in enumerate(reaches):
@@ -293,8 +299,8 @@ def test_reach_is_exact(name):
             assert depends(denoise, images, k, own) == (True, False)
 
 
-def test_nfor_survives_bad_pixels():
-    x, f = RNG.uniform(size=(2, 2, 12, 12, 3))
+def test_nfor_survives_bad_pixels(rng):
+    x, f = rng.uniform(size=(2, 2, 12, 12, 3))
     v = np.full((2, 12, 12, 3), 0.01)
     x[0, 3, 4], v[1, 6, 6], f[0, 9, 9] = np.nan, np.inf, np.nan
     x[1, 5, 5] = 1e6
@@ -307,7 +313,7 @@ def test_nfor_survives_bad_pixels():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_frame_without_what_it_needs():
+def test_frame_without_what_it_needs(rng):
     lacking = "nfor needs half buffers: render with variances, or at least 4"
     with pytest.raises(ValueError, match=lacking):
         nfor.denoise_frame(make_frame(jnp.ones((4, 4, 3))))
@@ -316,4 +322,4 @@ def test_frame_without_what_it_needs():
     with pytest.raises(ValueError, match=r"guide has shape \(5, 4, 3\), image has"):
         means(jnp.ones((4, 4, 3)), jnp.ones((5, 4, 3)), jnp.ones((5, 4, 3)))
     with pytest.raises(ValueError, match="window must be odd"):
-        means(*map(jnp.asarray, noisy()), window=4)
+        means(*map(jnp.asarray, noisy(rng)), window=4)

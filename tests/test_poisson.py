@@ -88,7 +88,7 @@ def test_gradients_and_vmap():
     given = problem((4, 5), channels=1)
     check_grads(solve, given, order=1, modes=["fwd", "rev"], rtol=1e-6)
     missing = given[0].at[1, 2].set(jnp.nan), *given[1:]
-    both = jax.vmap(reconstruct)(
+    both = jax.jit(jax.vmap(reconstruct))(
         *(jnp.stack(pair) for pair in zip(given, missing, strict=True))
     )
     np.testing.assert_allclose(both[0], solve(*given), rtol=1e-8, atol=1e-10)

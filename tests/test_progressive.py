@@ -12,11 +12,11 @@ from jscomb.denoisers import smoothing
 from jscomb.numerics import sure
 from tests.statistics import assert_mean, assert_mean_below
 
-RNG = np.random.default_rng(6)
+_RNG = np.random.default_rng(6)
 SHAPE = 12, 13, 3
-X, Y = (jnp.asarray(i) for i in RNG.uniform(0.5, 1.5, (2, *SHAPE)))
-V = jnp.asarray(RNG.uniform(0.001, 0.01, SHAPE))
-S = jnp.asarray(RNG.normal(0, 0.2, SHAPE))
+X, Y = (jnp.asarray(i) for i in _RNG.uniform(0.5, 1.5, (2, *SHAPE)))
+V = jnp.asarray(_RNG.uniform(0.001, 0.01, SHAPE))
+S = jnp.asarray(_RNG.normal(0, 0.2, SHAPE))
 combine = jax.jit(progressive.combine, static_argnames=("mix", "bound"))
 bound_mixing = jax.jit(progressive.bound_mixing, static_argnames="window")
 
@@ -55,9 +55,9 @@ def test_mixing_has_the_least_risk():
     assert_mean_below(z - y, 0)
 
 
-def test_risk_is_unbiased_for_a_fixed_mixing():
+def test_risk_is_unbiased_for_a_fixed_mixing(rng):
     truth = jnp.asarray(1 + np.add.outer(np.arange(9), np.arange(9))[..., None] / 9)
-    alpha = jnp.asarray(RNG.uniform(size=truth.shape))
+    alpha = jnp.asarray(rng.uniform(size=truth.shape))
     blur = lambda x: smoothing.box(x, window=3)
 
     @jax.jit
@@ -101,8 +101,8 @@ def bound_by_loops(alpha, x, y, v, *, window, strength, shift):
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-4, 1.0])
-def test_bound_is_the_loops(noise):
-    alpha = jnp.asarray(RNG.uniform(size=SHAPE))
+def test_bound_is_the_loops(noise, rng):
+    alpha = jnp.asarray(rng.uniform(size=SHAPE))
     y = X + np.sqrt(noise) * (Y - X)
     options = {"window": 5, "strength": 2.0, "shift": 4.2}
     expected = bound_by_loops(
@@ -115,11 +115,11 @@ def test_bound_is_the_loops(noise):
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.05])
-def test_the_bound_is_consistent(bias):
+def test_the_bound_is_consistent(bias, rng):
     """As samples grow a biased denoiser loses its share, an unbiased one keeps it."""
     shares = []
     for variance in (1e-1, 1e-3, 1e-5, 1e-7):
-        noise = np.sqrt(variance) * RNG.normal(size=(2, 24, 24, 3))
+        noise = np.sqrt(variance) * rng.normal(size=(2, 24, 24, 3))
         x, y = (
             1 + jnp.asarray(n) for n in noise * np.array([1, 0.1])[:, None, None, None]
         )
@@ -132,8 +132,8 @@ def test_the_bound_is_consistent(bias):
         assert min(shares) > 0.95
 
 
-def test_activation():
-    outputs = jnp.asarray(RNG.normal(size=(3, 4, 3, 2)))
+def test_activation(rng):
+    outputs = jnp.asarray(rng.normal(size=(3, 4, 3, 2)))
     found = progressive.activation(outputs)
     one, two, three = np.moveaxis(np.asarray(outputs), 2, 0)
     expected = np.clip((one - two) / np.maximum(three, 1e-6), 0, 1)

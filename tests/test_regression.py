@@ -10,8 +10,6 @@ from jscomb.numerics import regression
 from jscomb.numerics.regression import joint_local_linear
 from jscomb.numerics.weights import gaussian_weights
 
-RNG = np.random.default_rng(0)
-
 
 def gaussian(guide, bandwidth):
     """exp(-|g_i - g_c|^2 / h) of a window about c; h a number or the mean of two."""
@@ -65,12 +63,12 @@ def on_grid(c, window, stride):
     return (shift_row, shift_column) == (shift(column), shift(row))
 
 
-def images(height, width, features, channels=2):
+def images(rng, height, width, features, channels=2):
     """Target, guide and features."""
     return (
-        RNG.uniform(size=(height, width, channels)),
-        RNG.uniform(size=(height, width, 3)),
-        RNG.normal(size=(height, width, features)),
+        rng.uniform(size=(height, width, channels)),
+        rng.uniform(size=(height, width, 3)),
+        rng.normal(size=(height, width, features)),
     )
 
 
@@ -123,23 +121,23 @@ def assert_accurate(data, bandwidth, **options):
         ((4, 5), 2, 1, 1),
     ],
 )
-def test_is_the_loop(size, features, window, stride):
-    data = images(*size, features)
+def test_is_the_loop(size, features, window, stride, rng):
+    data = images(rng, *size, features)
     assert_accurate(data, 0.1, window=window, stride=stride)
 
 
-def test_a_bandwidth_for_each_pixel():
-    data = images(12, 20, 2)
-    bandwidth = RNG.uniform(0.02, 0.5, (12, 20, 1))
+def test_a_bandwidth_for_each_pixel(rng):
+    data = images(rng, 12, 20, 2)
+    bandwidth = rng.uniform(0.02, 0.5, (12, 20, 1))
     assert_accurate(data, bandwidth, window=7)
     same = fit(*map(jnp.asarray, data), jnp.full((12, 20, 1), 0.1), window=7)
     one = fit(*map(jnp.asarray, data), 0.1, window=7)
     np.testing.assert_allclose(same.prediction, one.prediction, rtol=1e-12)
 
 
-def test_two_targets_share_one_model():
-    (a, ga, features), (b, gb, _) = images(14, 18, 3), images(14, 18, 3)
-    ha, hb = RNG.uniform(0.05, 0.5, (2, 14, 18, 1))
+def test_two_targets_share_one_model(rng):
+    (a, ga, features), (b, gb, _) = images(rng, 14, 18, 3), images(rng, 14, 18, 3)
+    ha, hb = rng.uniform(0.05, 0.5, (2, 14, 18, 1))
     predict = gaussian(ga, 0.2)
     expected = oracle(
         [(a, gaussian(ga, ha)), (b, gaussian(gb, hb))],
@@ -163,7 +161,8 @@ def test_two_targets_share_one_model():
 
 def hard_cases():
     """Target, guide, features and bandwidth that break careless arithmetic."""
-    t, g, f = images(24, 26, 3)
+    rng = np.random.default_rng(0)
+    t, g, f = images(rng, 24, 26, 3)
     firefly = 1e-3 * t
     firefly[12, 13] = 1e6
     collinear = np.concatenate([f[..., :1], 2 * f[..., :1] + 1, 0 * f[..., :1]], -1)
@@ -197,9 +196,9 @@ def test_hard_cases(case):
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_the_middle_of_a_tile_lies_in_all_its_windows(stride):
+def test_the_middle_of_a_tile_lies_in_all_its_windows(stride, rng):
     """Features are taken relative to it: a bright one there must not drown the rest."""
-    t, g, f = images(24, 26, 3)
+    t, g, f = images(rng, 24, 26, 3)
     grid = regression._grid(11, stride)
     middle = grid.places[:, abs(grid.places - (grid.step - 1) / 2).sum(0).argmin()]
     row, column = middle + grid.step
@@ -217,17 +216,19 @@ def test_a_bright_pixel_keeps_its_light():
     np.testing.assert_allclose(found.prediction, spot, atol=1e-12)
 
 
-def test_equal_features_with_the_ridge_shared_are_one_feature():
-    t, g, f = map(jnp.asarray, images(12, 12, 1))
+def test_equal_features_with_the_ridge_shared_are_one_feature(rng):
+    t, g, f = map(jnp.asarray, images(rng, 12, 12, 1))
     twice = jnp.concatenate([f, f], axis=-1)
-    both = regression.local_linear(t, g, twice, 0.1, window=7)
-    one = regression.local_linear(t, g, f, 0.1, window=7, ridge=jnp.array([0.05]))
+    run = jax.jit(
+        lambda f, ridge: regression.local_linear(t, g, f, 0.1, window=7, ridge=ridge)
+    )
+    both, one = run(twice, jnp.array([0.1, 0.1])), run(f, jnp.array([0.05]))
     np.testing.assert_allclose(one.prediction, both.prediction, rtol=1e-10)
 
 
 @pytest.mark.parametrize("which", [0, 1, 2, 3])
-def test_a_bad_pixel_is_excluded(which):
-    data = [*images(13, 14, 2), RNG.uniform(0.1, 0.2, (13, 14, 1))]
+def test_a_bad_pixel_is_excluded(which, rng):
+    data = [*images(rng, 13, 14, 2), rng.uniform(0.1, 0.2, (13, 14, 1))]
     missing = data[0].copy()
     missing[4, 5] = np.nan
     weigh = gaussian(data[1], data[3])
@@ -247,9 +248,9 @@ def test_a_bad_pixel_is_excluded(which):
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_gradients(stride):
-    t, g, f = map(jnp.asarray, images(7, 8, 2, channels=1))
-    h = jnp.asarray(RNG.uniform(0.1, 0.2, (7, 8, 1)))
+def test_gradients(stride, rng):
+    t, g, f = map(jnp.asarray, images(rng, 7, 8, 2, channels=1))
+    h = jnp.asarray(rng.uniform(0.1, 0.2, (7, 8, 1)))
     ridge = jnp.array([0.1, 0.2])
 
     def predict(t, g, f, h, ridge):
@@ -260,10 +261,10 @@ def test_gradients(stride):
     check_grads(jax.jit(predict), (t, g, f, h, ridge), order=1, rtol=1e-5)
 
 
-def test_vmap_is_a_loop():
+def test_vmap_is_a_loop(rng):
     batch = [
         jnp.asarray(np.stack(i))
-        for i in zip(images(9, 9, 2), images(9, 9, 2), strict=True)
+        for i in zip(images(rng, 9, 9, 2), images(rng, 9, 9, 2), strict=True)
     ]
     run = lambda t, g, f: fit(t, g, f, 0.1, window=5)
     mapped = jax.jit(jax.vmap(run))(*batch)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import large
+from experiments.benchmarks import large
 from jscomb import exr, methods
 from jscomb.cli import _combining
 from jscomb.numerics import tiles

@@ -10,17 +10,16 @@ from jax.test_util import check_grads
 
 from jscomb.numerics import simplex
 
-RNG = np.random.default_rng(3)
 hull = jax.jit(simplex.hull)
 quadratic = jax.jit(simplex.quadratic)
 reference = jax.jit(simplex.reference)
 iterative = jax.jit(simplex.iterative, static_argnames="steps")
 
 
-def problems(n, kind, count=300):
+def problems(rng, n, kind, count=300):
     """Points and targets of both halves; every kind of trouble."""
-    a, b = RNG.normal(size=(2, n, count))
-    w = RNG.dirichlet(np.full(n, 0.2 if kind == "near an edge" else 1.0), count).T
+    a, b = rng.normal(size=(2, n, count))
+    w = rng.dirichlet(np.full(n, 0.2 if kind == "near an edge" else 1.0), count).T
     if kind == "sliver":
         b = a + 1e-4 * b
     if kind == "on a line":
@@ -31,7 +30,7 @@ def problems(n, kind, count=300):
         a, b = (np.broadcast_to(i[:1], i.shape) for i in (a, b))
     if kind == "a close pair":
         a[:2], b[:2] = 1e-5 * a[:2], 1e-5 * b[:2]
-    target_a, target_b = RNG.normal(size=(2, count))
+    target_a, target_b = rng.normal(size=(2, count))
     if kind in ("inside", "near an edge", "sliver", "faint"):
         target_b, target_a = (w * a).sum(0), (w * b).sum(0)
     if kind == "firefly":
@@ -87,9 +86,9 @@ def excess(w, best, a, b, target_a, target_b):
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 @pytest.mark.parametrize("kind", KINDS)
-def test_hull_is_optimal(n, kind):
+def test_hull_is_optimal(n, kind, rng):
     """By an optimum's conditions in float64; as good but for rounding in float32."""
-    data = problems(n, kind)
+    data = problems(rng, n, kind)
     best = np.asarray(hull(*data))
     assert optimality(best, *data) < 1e-8
     single = [jnp.asarray(i, jnp.float32) for i in data]
@@ -104,9 +103,9 @@ def test_hull_is_optimal(n, kind):
 
 @pytest.mark.parametrize("n", [2, 4])
 @pytest.mark.parametrize("kind", ["anywhere", "inside", "identical bases", "on a line"])
-def test_hull_and_quadratic_are_the_reference(n, kind):
+def test_hull_and_quadratic_are_the_reference(n, kind, rng):
     """Of the general solver the weights may differ, the objective not."""
-    data = problems(n, kind, 60)
+    data = problems(rng, n, kind, 60)
     general = np.asarray(reference(*data))
     assert optimality(general, *data) < 1e-6
     for w in (hull(*data), quadratic(matrix_of(*data))):
@@ -114,9 +113,9 @@ def test_hull_and_quadratic_are_the_reference(n, kind):
 
 
 @pytest.mark.parametrize("n", [5])
-def test_inside_the_hull_the_weights_are_nearest_to_uniform(n):
+def test_inside_the_hull_the_weights_are_nearest_to_uniform(n, rng):
     """Least |w|^2 of all that reach the target: every set of bases, by brute force."""
-    a, b, target_a, target_b = problems(n, "inside", 40)
+    a, b, target_a, target_b = problems(rng, n, "inside", 40)
     found = np.asarray(hull(a, b, target_a, target_b))
     for k in range(40):
         equations = np.stack([np.ones(n), a[:, k], b[:, k]])
@@ -143,45 +142,45 @@ def test_the_middle_of_a_square_is_a_quarter_of_each():
 
 
 @pytest.mark.parametrize("n", [3, 4])
-def test_bases_at_the_same_point_share_their_weight(n):
-    data = problems(n, "identical bases")
+def test_bases_at_the_same_point_share_their_weight(n, rng):
+    data = problems(rng, n, "identical bases")
     w = np.asarray(hull(*data))
     np.testing.assert_allclose(w[0], w[-1], rtol=1e-9)
-    same = np.asarray(hull(*problems(n, "all the same")))
+    same = np.asarray(hull(*problems(rng, n, "all the same")))
     np.testing.assert_allclose(same, 1 / n, rtol=1e-12)
     matrix = matrix_of(*data)
     w = np.asarray(quadratic(matrix))
     np.testing.assert_allclose(w[0], w[-1], atol=1e-5)
 
 
-def test_two_is_the_hull():
-    data = problems(2, "anywhere")
+def test_two_is_the_hull(rng):
+    data = problems(rng, 2, "anywhere")
     np.testing.assert_allclose(jax.jit(simplex.two)(*data), hull(*data), atol=1e-14)
 
 
-def test_the_iterative_solver_converges_to_the_hull():
-    data = problems(4, "anywhere", 50)
+def test_the_iterative_solver_converges_to_the_hull(rng):
+    data = problems(rng, 4, "anywhere", 50)
     best = hull(*data)
     run = lambda steps: np.asarray(iterative(jax.random.key(0), *data, steps=steps))
     gaps = [excess(run(steps), best, *data).max() for steps in (16, 256, 8192)]
     assert gaps[0] > gaps[1] > gaps[2]
     assert gaps[2] < 1e-3
     np.testing.assert_array_equal(run(16), run(16))
-    matrix = matrix_of(*data)
-    w = simplex.iterative_quadratic(jax.random.key(0), jnp.asarray(matrix), steps=8192)
+    by_matrix = jax.jit(simplex.iterative_quadratic, static_argnames="steps")
+    w = by_matrix(jax.random.key(0), matrix_of(*data), steps=8192)
     assert excess(np.asarray(w), best, *data).max() < 1e-3
 
 
-def random_matrix(n, rank, count=100):
+def random_matrix(rng, n, rank, count=100):
     """Positive semidefinite."""
-    d = RNG.normal(size=(n, rank, count))
+    d = rng.normal(size=(n, rank, count))
     return np.einsum("irm,jrm->ijm", d, d)
 
 
 @pytest.mark.parametrize(("n", "rank"), [(2, 1), (3, 3), (4, 2), (8, 3)])
-def test_quadratic_is_optimal(n, rank):
+def test_quadratic_is_optimal(n, rank, rng):
     """Slopes of all bases in use are equal and least; also with a number added."""
-    matrix = random_matrix(n, rank)
+    matrix = random_matrix(rng, n, rank)
     for constant in (0.0, -3.0, 50.0):
         w = np.asarray(quadratic(matrix + constant))
         slope = np.einsum("ijm,jm->im", matrix, w)
@@ -196,9 +195,9 @@ def test_quadratic_is_optimal(n, rank):
     assert abs(value(np.asarray(single, np.float64)) - value(w)).max() < 1e-4
 
 
-def test_a_matrix_that_is_not_semidefinite():
+def test_a_matrix_that_is_not_semidefinite(rng):
     """No estimate is one, but rounding may make one: feasible weights, gradients."""
-    a, d = RNG.normal(size=(6, 6, 6000)), RNG.normal(size=(6, 6000))
+    a, d = rng.normal(size=(6, 6, 6000)), rng.normal(size=(6, 6000))
     matrix = np.einsum("im,jm->ijm", d, d) * (1 + a + a.transpose(1, 0, 2))
     for dtype in (jnp.float32, jnp.float64):
         m = jnp.asarray(matrix, dtype)
@@ -219,25 +218,26 @@ def test_a_bad_base_does_not_drown_two_good_ones():
         np.testing.assert_allclose(w[:2], expected, atol=1e-4)
 
 
-def test_affine_weights_have_equal_slopes():
-    matrix = random_matrix(4, 6)
-    w = np.asarray(simplex.affine(jnp.asarray(matrix)))
+def test_affine_weights_have_equal_slopes(rng):
+    matrix = random_matrix(rng, 4, 6)
+    affine = jax.jit(simplex.affine)
+    w = np.asarray(affine(matrix))
     np.testing.assert_allclose(w.sum(0), 1, rtol=1e-10)
     slope = np.einsum("ijm,jm->im", matrix, w)
     np.testing.assert_allclose(slope - slope[:1], 0, atol=1e-8)
     pseudo = np.stack([np.linalg.pinv(matrix[..., k]).sum(0) for k in range(100)], -1)
     np.testing.assert_allclose(w, pseudo / pseudo.sum(0), rtol=1e-5)
-    singular = simplex.affine(jnp.asarray(random_matrix(4, 1)))
+    singular = affine(random_matrix(rng, 4, 1))
     assert np.isfinite(singular).all()
 
 
 @pytest.mark.parametrize("n", [2, 4])
 @pytest.mark.parametrize("kind", ["anywhere", "inside"])
-def test_gradients(n, kind):
+def test_gradients(n, kind, rng):
     """Of a few problems that are not next to a tie."""
-    data = [jnp.asarray(i[..., :6]) for i in problems(n, kind)]
+    data = [jnp.asarray(i[..., :6]) for i in problems(rng, n, kind)]
     check_grads(hull, data, order=1, eps=1e-7, rtol=1e-4, atol=1e-4)
-    matrix = jnp.asarray(random_matrix(n, n + 2, 6))
+    matrix = jnp.asarray(random_matrix(rng, n, n + 2, 6))
     symmetric = lambda m: quadratic((m + jnp.swapaxes(m, 0, 1)) / 2)
     check_grads(symmetric, (matrix,), order=1, eps=1e-7, rtol=1e-4, atol=1e-4)
 
@@ -253,24 +253,25 @@ quadratic_gradient = jax.jit(jax.grad(lambda m: numbered(quadratic(m))))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_are_finite_at_ties(kind):
+def test_gradients_are_finite_at_ties(kind, rng):
     for n in (3, 4):
-        data = [jnp.asarray(i, jnp.float32) for i in problems(n, kind, 50)]
+        data = [jnp.asarray(i, jnp.float32) for i in problems(rng, n, kind, 50)]
         assert all(np.isfinite(g).all() for g in hull_gradient(*data))
         if kind not in ("firefly", "bright"):
             matrix = jnp.asarray(matrix_of(*map(np.asarray, data)), jnp.float32)
             assert np.isfinite(quadratic_gradient(matrix)).all()
 
 
-def test_vmap_and_batch_axes():
-    a, b, target_a, target_b = problems(4, "anywhere", 24)
+def test_vmap_and_batch_axes(rng):
+    a, b, target_a, target_b = problems(rng, 4, "anywhere", 24)
     whole = hull(a, b, target_a, target_b)
     shaped = hull(*(i.reshape(*i.shape[:-1], 4, 6) for i in (a, b, target_a, target_b)))
     np.testing.assert_allclose(shaped.reshape(4, 24), whole, rtol=1e-12)
-    mapped = jax.vmap(simplex.hull, in_axes=-1, out_axes=-1)(a, b, target_a, target_b)
+    each = lambda solve: jax.jit(jax.vmap(solve, in_axes=-1, out_axes=-1))
+    mapped = each(simplex.hull)(a, b, target_a, target_b)
     np.testing.assert_allclose(mapped, whole, rtol=1e-12)
-    matrix = random_matrix(4, 4, 24)
-    mapped = jax.vmap(simplex.quadratic, in_axes=-1, out_axes=-1)(matrix)
+    matrix = random_matrix(rng, 4, 4, 24)
+    mapped = each(simplex.quadratic)(matrix)
     np.testing.assert_allclose(mapped, quadratic(matrix), rtol=1e-10, atol=1e-12)
 
 
@@ -290,10 +291,10 @@ def test_bad_input():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_problems_that_are_not_finite_say_nothing(bad):
+def test_problems_that_are_not_finite_say_nothing(bad, rng):
     """Equal weights there, and nothing else is touched; gradients too."""
-    a, b = jnp.asarray(RNG.normal(size=(2, 3, 5)))
-    target = jnp.asarray(RNG.normal(size=(2, 5)))
+    a, b = jnp.asarray(rng.normal(size=(2, 3, 5)))
+    target = jnp.asarray(rng.normal(size=(2, 5)))
     error = a - target[:1]
     matrix = error[:, None] * error[None] + jnp.eye(3)[..., None]
     for solve, given in (

@@ -10,12 +10,12 @@ from jscomb.denoisers import bilateral, smoothing
 from jscomb.numerics import sure
 from tests.statistics import assert_mean
 
-RNG = np.random.default_rng(5)
+_RNG = np.random.default_rng(5)
 SHAPE = 8, 9, 2
 TRUTH = jnp.asarray(1 + np.add.outer(np.arange(8), np.arange(9))[..., None] / [8, 16])
-VARIANCE = jnp.asarray(RNG.uniform(0.05, 0.2, SHAPE))
-FEATURES = jnp.asarray(RNG.uniform(size=(8, 9, 1)))
-WEIGHTS = [0.3 * jnp.asarray(RNG.normal(size=s)) for s in ((3, 3, 2, 4), (3, 3, 4, 2))]
+VARIANCE = jnp.asarray(_RNG.uniform(0.05, 0.2, SHAPE))
+FEATURES = jnp.asarray(_RNG.uniform(size=(8, 9, 1)))
+WEIGHTS = [0.3 * jnp.asarray(_RNG.normal(size=s)) for s in ((3, 3, 2, 4), (3, 3, 4, 2))]
 
 
 def linear(x):
@@ -91,8 +91,8 @@ def test_probes_average_to_the_exact_divergence(name):
 
 
 def test_divergence_of_a_linear_filter_is_its_matrix():
-    matrix = jax.jacfwd(linear)(TRUTH).reshape(TRUTH.size, TRUTH.size)
-    found = sure.exact_sure(linear, TRUTH, VARIANCE)
+    matrix = jax.jit(jax.jacfwd(linear))(TRUTH).reshape(TRUTH.size, TRUTH.size)
+    found = jax.jit(lambda x: sure.exact_sure(linear, x, VARIANCE))(TRUTH)
     expected = jnp.diag(matrix).reshape(SHAPE) * VARIANCE
     np.testing.assert_allclose(found.divergence, expected, rtol=1e-12)
     error = (linear(TRUTH) - TRUTH) ** 2 + 2 * expected - VARIANCE

@@ -35,34 +35,38 @@ def images(shape, seed=0):
     return np.random.default_rng(seed).normal(size=shape)
 
 
+FOLDS = {
+    windows.window_sum: np.sum,
+    windows.window_mean: np.mean,
+    windows.window_min: np.min,
+    windows.window_max: np.max,
+}
+
+
+@jax.jit
+def of_all_windows(image):
+    """Every function of every window, and the counts, by one program a shape."""
+    count = lambda w: windows.window_count(image.shape, w, dtype=image.dtype)
+    folded = {f: [f(image, window) for window in WINDOWS] for f in FOLDS}
+    return list(folded.values()), [count(window) for window in WINDOWS]
+
+
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize(
-    ("function", "fold"),
-    [
-        (windows.window_sum, np.sum),
-        (windows.window_mean, np.mean),
-        (windows.window_min, np.min),
-        (windows.window_max, np.max),
-    ],
-)
-def test_matches_loops(shape, window, function, fold):
+def test_matches_loops(shape):
     image = images(shape)
-    np.testing.assert_allclose(
-        function(jnp.asarray(image), window),
-        loop(image, window, fold),
-        rtol=1e-12,
-        atol=1e-12,
-    )
+    found, _ = of_all_windows(image)
+    for of_function, fold in zip(found, FOLDS.values(), strict=True):
+        for of_window, window in zip(of_function, WINDOWS, strict=True):
+            expected = loop(image, window, fold)
+            np.testing.assert_allclose(of_window, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("window", WINDOWS)
-def test_count_is_the_sum_of_ones(shape, window):
-    np.testing.assert_array_equal(
-        windows.window_count(shape, window, dtype=jnp.float64),
-        windows.window_sum(jnp.ones((*shape[:2], 1)), window),
-    )
+def test_count_is_the_sum_of_ones(shape):
+    _, counts = of_all_windows(images(shape))
+    for count, window in zip(counts, WINDOWS, strict=True):
+        ones = loop(np.ones((*shape[:2], 1)), window, np.sum)
+        np.testing.assert_array_equal(count, ones)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -109,20 +113,26 @@ def test_masked_pixels_are_excluded(window):
     included = np.where(mask, image, 0)
     count = loop(np.broadcast_to(mask, image.shape).astype(float), window, np.sum)
     total = loop(included, window, np.sum)
-    np.testing.assert_allclose(
-        windows.window_sum(hidden, window, mask=jnp.asarray(mask)), total, atol=1e-12
+    functions = (
+        windows.window_sum,
+        windows.window_mean,
+        windows.window_max,
+        windows.window_min,
     )
+    run = jax.jit(lambda i, mask: [f(i, window, mask=mask) for f in functions])
+    sums, means, maxima, minima = run(hidden, jnp.asarray(mask))
+    np.testing.assert_allclose(sums, total, atol=1e-12)
     np.testing.assert_allclose(
-        windows.window_mean(hidden, window, mask=jnp.asarray(mask)),
+        means,
         np.divide(total, count, out=np.zeros_like(total), where=count > 0),
         atol=1e-12,
     )
     np.testing.assert_array_equal(
-        windows.window_max(hidden, window, mask=jnp.asarray(mask)),
+        maxima,
         loop(np.where(mask, image, -np.inf), window, np.max),
     )
     np.testing.assert_array_equal(
-        windows.window_min(hidden, window, mask=jnp.asarray(mask)),
+        minima,
         loop(np.where(mask, image, np.inf), window, np.min),
     )
 
@@ -136,9 +146,8 @@ def test_gaussian_mean_matches_loops(shape):
         dy, dx = np.mgrid[rows, columns]
         weight = np.exp(-((dy - y) ** 2 + (dx - x) ** 2) / (2 * sigma**2))
         out[y, x, c] = np.average(image[rows, columns, c], weights=weight)
-    np.testing.assert_allclose(
-        windows.window_mean(jnp.asarray(image), window, sigma=sigma), out, rtol=1e-10
-    )
+    mean = jax.jit(lambda i: windows.window_mean(i, window, sigma=sigma))
+    np.testing.assert_allclose(mean(image), out, rtol=1e-10)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -155,14 +164,10 @@ def test_kernel_mean_matches_loops(shape):
                 total += weights[y, x, k] * image[v, u, c]
                 weight += weights[y, x, k]
         out[y, x, c] = total / weight
-    result = kernels.kernel_mean(jnp.asarray(image), jnp.asarray(weights), window)
-    np.testing.assert_allclose(result, out, rtol=1e-10)
-    check_grads(
-        jax.jit(lambda i, w: kernels.kernel_mean(i, w, window)),
-        (jnp.asarray(image), jnp.asarray(weights)),
-        order=1,
-        rtol=1e-4,
-    )
+    mean = jax.jit(lambda i, w: kernels.kernel_mean(i, w, window))
+    at = jnp.asarray(image), jnp.asarray(weights)
+    np.testing.assert_allclose(mean(*at), out, rtol=1e-10)
+    check_grads(mean, at, order=1, rtol=1e-4)
 
 
 def test_a_firefly_leaves_other_windows_exact():
@@ -248,7 +253,7 @@ def test_reach_is_how_far_windows_in_turn_see(chain):
             image = windows.window_sum(image, window)
         return image[0, 30, 0]
 
-    seen = np.flatnonzero(jax.grad(value)(jnp.zeros(61)))
+    seen = np.flatnonzero(jax.jit(jax.grad(value))(jnp.zeros(61)))
     assert windows.reach_of(*chain) == 30 - seen.min() == seen.max() - 30
     with pytest.raises(ValueError, match="window must be odd and positive, got 4"):
         windows.reach_of(*chain, 4)

@@ -1,4 +1,4 @@
-"""The command `jscomb`: combine, compare and describe rendered frames.
+"""The command `jscomb`: render, combine, compare and describe frames.
 
 Errors of the input are one line on standard error and exit status 2.
 """
@@ -15,11 +15,12 @@ from typing import Any
 import jax
 import tyro
 
-from jscomb import methods
+from jscomb import methods, rendering
 from jscomb.cli._combining import combine
+from jscomb.cli._rendering import render, render_file
 from jscomb.cli._showing import compare, demo, info
 
-__all__ = ["main"]
+__all__ = ["main", "render_file"]
 
 
 def main() -> None:
@@ -43,7 +44,8 @@ def _parse() -> Callable[[], None]:
         def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return lambda: command(*args, **kwargs)
 
-        bind.__doc__ = (command.__doc__ or "").replace("{methods}", listed)
+        doc = (command.__doc__ or "").replace("{methods}", listed)
+        bind.__doc__ = doc.replace("{scenes}", ", ".join(rendering.SCENES))
         return bind
 
     listed = "; ".join(f"{n} ({m.summary})" for n, m in methods.METHODS.items())
@@ -51,7 +53,7 @@ def _parse() -> Callable[[], None]:
     try:
         with contextlib.redirect_stderr(said):
             return tyro.extras.subcommand_cli_from_dict(
-                {c.__name__: later(c) for c in (demo, combine, compare, info)},
+                {c.__name__: later(c) for c in (demo, render, combine, compare, info)},
                 prog="jscomb",
                 description="Combine unbiased and biased Monte Carlo renderings.",
             )

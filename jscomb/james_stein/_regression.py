@@ -17,7 +17,7 @@ and y^_b the same way with the halves exchanged; their mean y* = (y^_a + y^_b) /
 the new biased image. Target and guide are independent, so the fit does not follow the
 noise.
 
-Differences from the paper, all measured (`experiments/regression_error.py`): the
+Differences from the paper, all measured (`experiments/james_stein`): the
 constant has no ridge; where windows have hardly any weight a pixel fades to y instead
 of falling back abruptly; and kappa is a median, because the mean over a frame is
 dominated by the edges of its light sources and blurs all other edges.

@@ -21,7 +21,8 @@ def log_l2(image: Image, reference: Image, *, epsilon: float = 0.01) -> Scalar:
     Args:
         image: normalised radiance, shape [H,W,C].
         reference: normalised radiance, shape [H,W,C].
-        epsilon: added to the squared reference, so that black pixels do not dominate.
+        epsilon: added to the squared mean of the reference's channels, so that black
+            pixels do not dominate.
 
     Returns:
         the mean over pixels and channels.
@@ -38,7 +39,7 @@ def log_l2(image: Image, reference: Image, *, epsilon: float = 0.01) -> Scalar:
     """
     check_same_shape(image=image, reference=reference)
     found, truth = compress(image), compress(reference)
-    weight = jnp.mean(jnp.square(truth), axis=-1, keepdims=True) + epsilon
+    weight = jnp.square(jnp.mean(truth, axis=-1, keepdims=True)) + epsilon
     return jnp.mean(jnp.square(found - truth) / weight)
 
 

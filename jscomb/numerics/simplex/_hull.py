@@ -145,9 +145,19 @@ def share_of(first: Plane, second: Plane, c: Plane) -> Float[Array, " m"]:
     d = second - first
     square = jnp.sum(d * d, axis=0)
     along = -jnp.sum((first + c) * d, axis=0)
+    return share_within(along, square, 0.5)
+
+
+def share_within(
+    along: Float[Array, " m"], square: Float[Array, " m"], otherwise: float
+) -> Float[Array, " m"]:
+    """Return along / square between 0 and 1; `otherwise` where the square is 0.
+
+    The ends have no derivative: that of a huge quotient would not be finite.
+    """
     inside = (along > 0) & (along < square)
     share = divide(along, square, where=inside)
-    end = jnp.where(square > 0, jnp.where(along > 0, 1.0, 0.0), 0.5)
+    end = jnp.where(square > 0, jnp.where(along > 0, 1.0, 0.0), otherwise)
     return jnp.where(inside, share, end.astype(share.dtype))
 
 

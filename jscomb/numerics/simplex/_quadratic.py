@@ -7,7 +7,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics import cholesky
-from jscomb.numerics.guards import divide
 from jscomb.numerics.simplex._active_set import (
     Flat,
     Free,
@@ -17,6 +16,7 @@ from jscomb.numerics.simplex._active_set import (
     shared_by_equals,
     sums_to_one,
 )
+from jscomb.numerics.simplex._hull import share_within
 
 Matrix = Float[Array, "n n *batch"]
 Weights = Float[Array, "n *batch"]
@@ -191,5 +191,4 @@ def share_along(objective: Objective, w: Flat, base: Array) -> Float[Array, " m"
     square = jnp.sum(d * curved, axis=0)
     slope = jnp.sum(objective.matrix * w[None], axis=1) + objective.linear
     along = -jnp.sum(d * slope, axis=0)
-    share = divide(along, square, where=square > 0)
-    return jnp.clip(share, 0.0, 1.0)
+    return share_within(along, square, 0.0)

@@ -1,0 +1,1 @@
+"""What functions cost, and how they grow."""

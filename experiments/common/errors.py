@@ -1,0 +1,75 @@
+"""Errors against a reference with noise of its own, and their means over frames."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from experiments.common.tables import table
+from jscomb.frame import Frame
+from jscomb.metrics import rel_l2
+from jscomb.typing import Image
+
+Row = Mapping[str, float]
+
+
+def relative_l2(image: Image, frame: Frame) -> float:
+    """Measure an image's relative L2, less the reference's noise.
+
+    Args:
+        image: in the frame's unit, [H,W,C].
+        frame: with a reference.
+
+    Returns:
+        the error, relative to the reference squared (plus 0.01).
+    """
+    assert frame.reference is not None
+    image_of, noise = frame.reference
+    return float(rel_l2(image, image_of, half_difference=noise))
+
+
+def geometric_mean(values: Iterable[float]) -> float:
+    """Return the geometric mean of positive numbers."""
+    return float(np.exp(np.mean(np.log([*values]))))
+
+
+def by_samples(rows: Mapping[str, Row]) -> dict[int, list[Row]]:
+    """Group frames by their samples a pixel.
+
+    Args:
+        rows: by "frame samples".
+
+    Returns:
+        rows by sample count, ascending.
+    """
+    counts = sorted({int(name.split()[-1]) for name in rows})
+    return {c: [r for n, r in rows.items() if n.split()[-1] == f"{c}"] for c in counts}
+
+
+def means(
+    rows: Mapping[str, Row],
+    methods: Sequence[str],
+    baseline: Callable[[Row], float],
+    *,
+    title: str,
+) -> str:
+    """Tabulate geometric means over frames, and the worst of all.
+
+    Args:
+        rows: errors by method, by "frame samples".
+        methods: to show.
+        baseline: the error that a row's errors are divided by.
+        title: of the first column.
+
+    Returns:
+        Markdown: a line a method, a column a sample count, then all frames and the
+        worst of them.
+    """
+    groups = by_samples(rows)
+
+    def cells(method: str) -> list[object]:
+        ratios = {c: [r[method] / baseline(r) for r in g] for c, g in groups.items()}
+        every = [ratio for some in ratios.values() for ratio in some]
+        mean = [geometric_mean(some) for some in ratios.values()]
+        return [method, *mean, geometric_mean(every), max(every)]
+
+    return table([title, *groups, "all", "worst"], map(cells, methods))

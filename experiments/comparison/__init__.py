@@ -1,0 +1,1 @@
+"""Every combiner beside every other."""

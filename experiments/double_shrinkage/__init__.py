@@ -1,0 +1,1 @@
+"""Double shrinkage of two integrators."""

@@ -1,0 +1,210 @@
+"""How exact is each solver of the ensemble's weights, and what does it cost?
+
+    python -m experiments.ensemble.ensemble_solvers FOLDER
+
+Real bases of one frame of the folder (`archives`), repeated to a size, two to eight
+of them: the six denoisers, the unbiased image and a 7x7 box. Three tables:
+
+    gap      what a solver's objective exceeds the least by, relative to that of the
+             worst base, per pixel and channel: largest, mean, least. The least there
+             is comes from `hull` in float64; no solver may be below it.
+    time     seconds a megapixel of three channels, of each solver by number of bases.
+    parts    of the whole ensemble, and the weight filter beside nothing but the
+             exponentials that it takes, of random images of 1024x1024.
+"""
+
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments.common import archives
+from experiments.common.timing import medians
+from experiments.ensemble.bases import bases_of, unbiased_of
+from jscomb import ensemble
+from jscomb.denoisers import smoothing
+from jscomb.frame import with_halves
+from jscomb.numerics import simplex
+
+STEPS = 64, 256, 1024, 4096
+CHECKED = 256  # problems that the reference solves; it takes a millisecond each
+CONVERGED = 1024  # the iterative solver's default, and the paper's
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to measure.
+
+    Attributes:
+        folder: of NumPy archives.
+        frame: which of them.
+        samples: samples a pixel.
+        size: width and height to repeat the frame to.
+        repeats: timed calls of each function.
+        quick: small images, three bases, few steps.
+    """
+
+    folder: tyro.conf.Positional[pathlib.Path]
+    frame: str = "staircase2"
+    samples: int = 64
+    size: int = 512
+    repeats: int = 3
+    quick: bool = False
+
+
+iterative = jax.jit(simplex.iterative, static_argnames="steps")
+exact = jax.jit(simplex.hull)
+general = jax.jit(simplex.reference)
+
+
+@jax.jit
+def quadratic(*halves):
+    """The solver for any matrix, on that of each pixel and channel."""
+    matrix = ensemble.error_matrix(
+        *halves, windows=(1,), whole_frame=False, shared=False
+    )
+    return simplex.quadratic(matrix)
+
+
+def repeated(images: jax.Array, size: int) -> jax.Array:
+    """Images [N,H,W,C] mirrored over and over to [N,size,size,C]."""
+    short = [(0, max(0, size - n)) for n in images.shape[1:3]]
+    padded = np.pad(images, [(0, 0), *short, (0, 0)], mode="symmetric")
+    return jnp.asarray(padded[:, :size, :size])
+
+
+def problems(config: Config, size: int) -> list[jax.Array]:
+    """y^a and y^b [8,size,size,3], x_a and x_b [size,size,3]."""
+    frame = archives.load(config.folder / f"{config.frame}.npz", config.samples)
+    frame = frame.normalised()
+    box = with_halves(frame, lambda part: smoothing.box(part.color))
+    more = {"x": unbiased_of(frame), "box": box}
+    _, a, b = ensemble.stack_estimates(bases_of(frame) | more)
+    x = jnp.stack([half.color for half in frame.halves()])
+    a, b, (x_a, x_b) = (repeated(images, size) for images in (a, b, x))
+    return [a, b, x_a, x_b]
+
+
+def objective(w, a, b, x_a, x_b) -> np.ndarray:
+    """|w'y^a - x_b|^2 + |w'y^b - x_a|^2 of each pixel and channel, in float64."""
+    w, a, b, x_a, x_b = (np.asarray(i, np.float64) for i in (w, a, b, x_a, x_b))
+    w = w / w.sum(0)  # float32 weights' sum is one to rounding
+    return ((w * a).sum(0) - x_b) ** 2 + ((w * b).sum(0) - x_a) ** 2
+
+
+def gaps(data: list[jax.Array], steps: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """By solver, how far each problem's objective is above the least."""
+    a, b, x_a, x_b = data
+    with jax.enable_x64(True):
+        double = [jnp.asarray(np.asarray(i), jnp.float64) for i in data]
+        least = objective(exact(*double), *data)
+        worst = ((a - x_b) ** 2 + (b - x_a) ** 2).max(0)
+        worst = np.where(worst > 0, worst, 1)
+        some = [i.reshape(*i.shape[:-3], -1)[..., :CHECKED] for i in double]
+        found = {"reference (OSQP)": objective(general(*some), *some)}
+    found["hull"] = objective(exact(*data), *data)
+    found["quadratic"] = objective(quadratic(*data), *data)
+    for count in steps:
+        w = iterative(jax.random.key(0), *data, steps=count)
+        found[f"iterative, {count} steps"] = objective(w, *data)
+    return {
+        name: ((each.ravel() - least.ravel()[: each.size]) / worst.ravel()[: each.size])
+        for name, each in found.items()
+    }
+
+
+def times(data: list[jax.Array], repeats: int) -> dict[str, float]:
+    """Seconds a megapixel by solver."""
+    key = jax.random.key(0)
+    calls: dict[str, Callable] = {
+        "hull": functools.partial(exact, *data),
+        "quadratic": functools.partial(quadratic, *data),
+        "iterative": functools.partial(iterative, key, *data, steps=CONVERGED),
+    }
+    found = medians(calls, repeats)
+    with jax.enable_x64(True):
+        flat = [np.asarray(i).reshape(*i.shape[:-3], -1)[..., :CHECKED] for i in data]
+        some = [jnp.asarray(i, jnp.float64) for i in flat]
+        few = medians({"reference": functools.partial(general, *some)}, 1)
+    pixels = data[2].size / 3
+    megapixel = {name: 1e6 * each / pixels for name, each in found.items()}
+    return megapixel | {"reference": 3e6 * few["reference"] / CHECKED}
+
+
+def parts(data: list[jax.Array], size: int, repeats: int) -> dict[str, float]:
+    """Seconds of the ensemble's parts; and of the filter with its lower bound."""
+    matrix = jax.jit(ensemble.error_matrix)
+    ready = matrix(*data)
+    key = jax.random.key(0)
+    z, v, albedo, normal = jax.random.uniform(key, (4, size, size, 3))
+    weights = jax.random.dirichlet(key, jnp.ones(4), (size, size, 3))
+    smooth = jax.jit(
+        lambda w: ensemble.filter_weights(w, z, v, albedo=albedo, normal=normal)
+    )
+
+    @jax.jit
+    def exponentials(image):
+        """As many as the filter takes: one a pixel of each window of 15x15."""
+        add = lambda k, total: total + jnp.exp(-image * (1 + 1e-3 * k))
+        return jax.lax.fori_loop(0, 15**2, add, jnp.zeros_like(image))
+
+    multi = jax.jit(functools.partial(ensemble.solve_weights, solver="multi-scale"))
+    calls: dict[str, Callable] = {
+        "hull": functools.partial(exact, *data),
+        "error_matrix, multi-scale": functools.partial(matrix, *data),
+        "quadratic on it": functools.partial(jax.jit(simplex.quadratic), ready),
+        "solve_weights, multi-scale": functools.partial(multi, *data),
+        "filter_weights": functools.partial(smooth, jnp.moveaxis(weights, -1, 0)),
+        "its exponentials": functools.partial(exponentials, z[..., 0]),
+    }
+    return medians(calls, repeats)
+
+
+def run(config: Config) -> dict[str, dict]:
+    """Measure everything.
+
+    Args:
+        config: what to measure.
+
+    Returns:
+        `gap`: by number of bases and solver, gaps of all problems; `time`: seconds a
+        megapixel likewise; `parts`: seconds by name.
+    """
+    quick = config.quick
+    size, repeats = (48, 1) if quick else (config.size, config.repeats)
+    a, b, x_a, x_b = problems(config, size)
+    found: dict[str, dict] = {"gap": {}, "time": {}}
+    for n in tqdm([3] if quick else range(2, 9), unit="bases"):
+        data = [a[:n], b[:n], x_a, x_b]
+        found["gap"][n] = gaps(data, STEPS[:1] if quick else STEPS)
+        found["time"][n] = times(data, repeats)
+    found["parts"] = parts([a[:4], b[:4], x_a, x_b], 2 * size, repeats)
+    return found
+
+
+def main() -> None:
+    """Print the tables."""
+    config = tyro.cli(Config, description=__doc__)
+    found = run(config)
+    print("| solver | bases | largest gap | mean | least |\n" + "| --- " * 5 + "|")
+    for n, gap in found["gap"].items():
+        for name, each in gap.items():
+            row = f"{each.max():.1e} | {each.mean():.1e} | {each.min():.1e}"
+            print(f"| {name} | {n} | {row} |")
+    names = list(next(iter(found["time"].values())))
+    print(f"\n| bases | {' | '.join(names)} |\n" + "| --- " * (len(names) + 1) + "|")
+    for n, spent in found["time"].items():
+        print(f"| {n} | {' | '.join(f'{spent[name]:.2f}' for name in names)} |")
+    print()
+    for name, seconds in found["parts"].items():
+        print(f"{name:<30}{1e3 * seconds:>10.1f} ms")
+
+
+if __name__ == "__main__":
+    main()

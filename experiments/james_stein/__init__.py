@@ -1,0 +1,1 @@
+"""James-Stein combination, and cross-regression."""

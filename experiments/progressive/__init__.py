@@ -1,0 +1,1 @@
+"""SURE, and progressive denoising."""

@@ -1,0 +1,1 @@
+"""The promises that every public function keeps, and the functions."""

@@ -1,0 +1,70 @@
+"""What functions cost: their work is counted right, and what was measured is kept."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from experiments.benchmarks import performance
+from experiments.benchmarks.work import Work, work_of
+
+M, N, K = 3, 5, 7
+
+
+def scanned(x):
+    """Ten exponentials of each number."""
+    return jax.lax.scan(lambda c, _: (jnp.exp(c), None), x, length=10)[0]
+
+
+def branched(x):
+    """The dearer branch counts."""
+    return jax.lax.cond(x[0] > 0, lambda x: jnp.sin(jnp.sin(x)), jnp.exp, x)
+
+
+@pytest.mark.parametrize(
+    ("function", "shapes", "expected"),
+    [
+        (jnp.matmul, [(M, K), (K, N)], {"products": 2 * M * N * K}),
+        (lambda x: x[::2] + 1, [(8,)], {"operations": 4}),
+        (scanned, [(6,)], {"exponentials": 60}),
+        (jax.jit(scanned), [(6,)], {"exponentials": 60}),
+        (branched, [(6,)], {"exponentials": 12, "operations": 1}),
+        (jnp.sum, [(9,)], {"operations": 9}),
+        (jax.vmap(jnp.dot), [(4, K), (4, K)], {"products": 2 * 4 * K}),
+    ],
+)
+def test_work_is_counted(function, shapes, expected):
+    arrays = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    found = work_of(function, *arrays)
+    for kind in ("products", "operations", "exponentials"):
+        assert getattr(found, kind) == expected.get(kind, 0), kind
+    made = jax.eval_shape(function, *arrays)
+    assert found.moved == 4 * sum(each.size for each in (*arrays, made))
+
+
+def test_what_is_not_used_is_not_moved():
+    arrays = [jnp.ones(8, jnp.float32), jnp.ones(100, jnp.float32)]
+    assert work_of(lambda x, y: x, *arrays).moved == 64
+
+
+def test_time_is_that_of_computing_or_moving():
+    rates = Work(10.0, 2.0, 1.0, 4.0)
+    assert Work(10, 2, 1, 4).seconds(rates) == 3
+    assert Work(1, 0, 0, 40).seconds(rates) == 10
+
+
+def test_performance_is_measured_and_kept(tmp_path, monkeypatch):
+    config = performance.Config(tmp_path / "costs.jsonl", quick=True)
+    found = performance.run(config)
+    assert set(found) == set(performance.functions(quick=True))
+    for costs in found.values():
+        assert list(costs) == [32, 64]
+        for cost in costs.values():
+            assert cost.seconds > 0
+            assert cost.ceiling > 0
+            assert cost.compiling > 0
+
+    def never(*_):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(performance, "measure", never)
+    assert performance.run(config) == found

@@ -1,0 +1,107 @@
+"""What experiments share: archives, results that are kept, reports and their index."""
+
+import importlib
+import pathlib
+import pkgutil
+import sys
+
+import numpy as np
+import pytest
+
+import experiments
+from experiments.common import archives, command, errors, index, report
+from experiments.common.results import Results
+from experiments.common.tables import table
+from experiments.james_stein import error
+
+FOLDERS = sorted(path.parent for path in index.EXPERIMENTS.glob("*/__init__.py"))
+SECTIONS = [section for folder in FOLDERS for section in report.read(folder)]
+
+
+def test_archives_are_frames(folder, glass_frame):
+    frame = archives.load(folder / "glass.npz", 64)
+    assert frame.samples == 64
+    np.testing.assert_allclose(frame.color, glass_frame.color, rtol=1e-6)
+    np.testing.assert_allclose(frame.variance, glass_frame.variance, rtol=1e-5)
+    np.testing.assert_allclose(frame.depth, glass_frame.depth, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"has \[64\] samples, not 128"):
+        archives.load(folder / "glass.npz", 128)
+
+
+def test_results_go_on_after_a_line_cut_short(tmp_path):
+    path = tmp_path / "new" / "kept.jsonl"
+    first = Results(path)
+    assert first.get("a", lambda: [1.5]) == [1.5]
+    assert first.get("b", lambda: 2) == 2
+    path.write_text(path.read_text()[:-2])  # interrupted while writing b
+    again = Results(path)
+    assert again.get("a", lambda: pytest.fail("measured twice")) == [1.5]
+    assert again.get("b", lambda: 3) == 3
+    assert Results(path).values == {"a": [1.5], "b": 3}
+
+
+def test_tables_are_markdown():
+    found = table(["name", 16], [["a", 0.12345], ["b", None], ["c", 123456.0]])
+    assert found.splitlines() == [
+        "| name | 16 |",
+        "| --- | --- |",
+        "| a | 0.123 |",
+        "| b |  |",
+        "| c | 1.23e+05 |",
+    ]
+
+
+def test_means_are_geometric_and_beside_the_worst():
+    rows = {
+        "x 4": {"y": 1.0, "z": 2.0},
+        "w 4": {"y": 1.0, "z": 8.0},
+        "x 16": {"y": 2.0, "z": 2.0},
+    }
+    found = errors.means(rows, ["z"], lambda row: row["y"], title="z / y")
+    assert found.splitlines()[0] == "| z / y | 4 | 16 | all | worst |"
+    assert found.splitlines()[2] == "| z | 4.00 | 1.00 | 2.52 | 8.00 |"
+
+
+def test_a_report_replaces_the_one_before(folder, monkeypatch, capsys, tmp_path):
+    """Question, answer, command, date and tables, read back as they were written."""
+    place = tmp_path / "report"
+    arguments = [str(folder), "--quick", "--report", str(place)]
+    monkeypatch.setattr(sys, "argv", ["error", *arguments])
+    command.main(error.Config, error.run, error.report)
+    capsys.readouterr()
+    command.main(error.Config, error.run, error.report)
+    (section,) = report.read(place)
+    assert section.module == "experiments.james_stein.error"
+    assert section.question == error.__doc__.splitlines()[0]
+    assert section.answer in capsys.readouterr().out
+    assert section.command.startswith(f"python -m {section.module} ")
+    assert section.date in report.circumstances()
+    monkeypatch.setattr(sys, "argv", ["error", str(place)])
+    with pytest.raises(SystemExit, match=r"^experiments.*error: .* no \.npz archive"):
+        command.main(error.Config, error.run, error.report)
+
+
+def test_the_index_is_of_the_results():
+    assert index.README.read_text() == index.indexed(index.README.read_text())
+    assert len(index.README.read_text().splitlines()) < 100
+
+
+def commands():
+    """Modules of the experiments that answer a question: they have a report."""
+    names = [
+        found.name
+        for found in pkgutil.walk_packages(experiments.__path__, "experiments.")
+        if not found.ispkg
+    ]
+    modules = map(importlib.import_module, names)
+    return {m.__name__ for m in modules if {"run", "report"} <= vars(m).keys()}
+
+
+def test_every_result_is_of_a_command():
+    """That is still there, asks the same question, and measured all of it."""
+    assert {section.module for section in SECTIONS} <= commands()
+    for section in SECTIONS:
+        module = importlib.import_module(section.module)
+        assert " ".join(module.__doc__.split("\n\n")[0].split()) == section.question
+        assert "--quick" not in section.command
+        assert pathlib.Path(module.__file__).parent in FOLDERS

@@ -1,0 +1,63 @@
+"""The experiments in `james_stein` run, and say what they measured."""
+
+import numpy as np
+
+from experiments.common import archives
+from experiments.james_stein import (
+    error,
+    parts,
+    regression,
+)
+from jscomb import metrics
+
+
+def test_errors_are_those_of_the_metrics(folder, glass_frame):
+    found = error.run(error.Config(folder, quick=True))
+    (name, errors), *_ = found.rows.items()
+    assert name == "glass 64"
+    assert errors.keys() == {*error.INPUTS, *error.COMBINERS, "auto", "dual"}
+    frame = glass_frame.normalised()
+    r, noise = frame.reference
+    expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
+    np.testing.assert_allclose(errors["oidn"], expected, rtol=1e-5)
+    assert errors["auto"] in (errors["oidn"], errors["whitened"])
+    assert error.CEILING in found.seconds
+    assert all(seconds > 0 for seconds in found.seconds.values())
+
+
+def test_regression_is_measured(folder, tmp_path):
+    config = regression.Config(
+        folder, tmp_path / "kept.jsonl", stride=4, window=11, quick=True
+    )
+    measured = regression.run(config)
+    found = measured.rows
+    assert found.keys() == {f"glass 64 {b}" for b in (*regression.BASES, "NFOR")}
+    kept = config.results.read_text()
+    assert all(name in kept for name in found)
+    row = found["glass 64 oidn"]
+    frame = archives.load(folder / "glass.npz", 64).normalised()
+    r, noise = frame.reference
+    expected = metrics.rel_l2(frame.estimates["oidn"].image, r, half_difference=noise)
+    np.testing.assert_allclose(row["y"], expected, rtol=1e-6)
+    assert row["features"] == 8
+    image, seconds = regression.regressed(frame, regression.Setting(4, 11), 1)
+    error = metrics.rel_l2(image, r, half_difference=noise)
+    np.testing.assert_allclose(row["y*"], error, rtol=1e-5)
+    assert seconds > 0
+    said = regression.report(measured)
+    assert f"{row['y*'] / row['y']:.2f} of its error" in said.answer
+    assert f"| {row['y']:#.3g} |" in said.body
+
+
+def test_useful_operations_are_those_of_clipped_windows():
+    r, n = parts.WINDOW // 2, 40
+    near = abs(np.subtract.outer(np.arange(n), np.arange(n))) <= r
+    assert parts.useful_operations(n) == 2 * 151 * near.sum() ** 2
+
+
+def test_ratios_are_to_the_first_setting():
+    first, other = regression.FIRST, regression.Setting(stride=2)
+    found = {first: ([1.0, 2.0], [4.0, 4.0]), other: ([2.0, 1.0], [1.0, 1.0])}
+    ratios = regression.ratios(found)
+    assert ratios["stride 1, 51x51"] == (1, 1, 1)
+    np.testing.assert_allclose(ratios["stride 2"], (1, 2, 0.25))

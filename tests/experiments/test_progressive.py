@@ -1,0 +1,46 @@
+"""The experiments in `progressive` run, and say what they measured."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.progressive import progressive, sure
+from jscomb.denoisers import oidn
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+def test_a_progressive_rendering_knows_its_error(tmp_path):
+    """Stages of doubling samples; errors fall; it stops where it was asked to."""
+    config = progressive.Config(
+        "cornell-box", tmp_path, size=24, spp=32, first=8, reference_spp=256
+    )
+    found = progressive.run(config)
+    assert list(found) == [8, 16, 32]
+    for samples, row in found.items():
+        assert (tmp_path / f"{samples:05d}.png").stat().st_size > 10_000
+        for true, estimated in row.values():
+            assert np.isfinite([true, estimated]).all()
+        true, estimated = row["samples"]
+        assert 0.3 * true < estimated < 3 * true
+    assert found[32]["samples"][0] < found[8]["samples"][0]
+    assert (tmp_path / "errors.png").exists()
+    sooner = dataclasses.replace(config, target=1e9)
+    assert list(progressive.run(sooner)) == [32]  # all that was there already
+    with pytest.raises(ValueError, match="first must be from 2 to spp = 32: 1"):
+        dataclasses.replace(config, first=1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+def test_sure_is_compared_with_the_truth(folder):
+    """One derivative has more digits than differences of any step."""
+    found = sure.run(sure.Config(folder, quick=True))
+    digits = found["digits"]
+    assert digits["jvp"] < min(error for name, error in digits.items() if name != "jvp")
+    (row,) = found["frames"].values()
+    said = sure.report(found)
+    ratio = row["james-stein, whitened 7x7, corrected"] / row["oidn"]
+    assert f"{ratio:.2f} of the denoiser's error" in said.answer
+    assert f"| glass 64 | {row['path tracing']:#.3g} |" in said.body

@@ -1,0 +1,1 @@
+"""Damaged, hostile and unusual EXR files."""
