@@ -51,6 +51,7 @@ def means(
     baseline: Callable[[Row], float],
     *,
     title: str,
+    beside: Mapping[str, Callable[[str], object]] = {},
 ) -> str:
     """Tabulate geometric means over frames, and the worst of all.
 
@@ -59,10 +60,11 @@ def means(
         methods: to show.
         baseline: the error that a row's errors are divided by.
         title: of the first column.
+        beside: more columns, functions of a method by their titles.
 
     Returns:
-        Markdown: a line a method, a column a sample count, then all frames and the
-        worst of them.
+        Markdown: a line a method, a column a sample count, then all frames, the worst
+        of them, and more columns.
     """
     groups = by_samples(rows)
 
@@ -70,6 +72,7 @@ def means(
         ratios = {c: [r[method] / baseline(r) for r in g] for c, g in groups.items()}
         every = [ratio for some in ratios.values() for ratio in some]
         mean = [geometric_mean(some) for some in ratios.values()]
-        return [method, *mean, geometric_mean(every), max(every)]
+        more = [of(method) for of in beside.values()]
+        return [method, *mean, geometric_mean(every), max(every), *more]
 
-    return table([title, *groups, "all", "worst"], map(cells, methods))
+    return table([title, *groups, "all", "worst", *beside], map(cells, methods))

@@ -1,9 +1,11 @@
-"""The bases of the ensemble experiments: six real denoisers, each with halves."""
+"""What the ensemble experiments share: six real denoisers, and rendered frames."""
 
 import functools
+import pathlib
 
 import jax
 
+from jscomb import rendering
 from jscomb.frame import Estimate, Frame, Maker, with_halves
 from jscomb.methods import METHODS
 
@@ -40,3 +42,18 @@ def bases_of(frame: Frame) -> dict[str, Estimate]:
 def unbiased_of(frame: Frame) -> Estimate:
     """The unbiased image as one more base."""
     return with_halves(frame, lambda part: part.color)
+
+
+def rendered(scene: str, work: pathlib.Path, settings: rendering.Settings) -> Frame:
+    """Render a scene, or take what a run has left.
+
+    Args:
+        scene: name of a scene, see `jscomb.rendering`.
+        work: .npz file that keeps what is rendered; its folder is made.
+        settings: what is rendered.
+
+    Returns:
+        the frame.
+    """
+    work.parent.mkdir(parents=True, exist_ok=True)
+    return rendering.render(scene, settings, partial=work)

@@ -1,13 +1,10 @@
 """How does a progressive rendering's error fall, and does the renderer know it?
 
-    python -m experiments.progressive.progressive cornell-glass --out FOLDER
-
 Renders with Mitsuba, twice as many samples each time, up to a budget or an estimated
 error. After every batch: mean and variance of the samples so far (Welford), Open Image
-Denoise, SURE, and both mixed (`jscomb.progressive`). Prints the errors of samples,
-denoised and mixed image, relative to the reference squared (plus 0.01), as they are and
-as estimated without the reference; writes a picture of each stage, and a plot of the
-errors. An interrupted run goes on where it was.
+Denoise, SURE, and both mixed (`jscomb.progressive`). Relative L2, less the reference's
+noise, of samples, denoised and mixed image, as it is and as estimated without the
+reference. An interrupted run goes on where it was.
 """
 
 import dataclasses
@@ -18,24 +15,26 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import tyro
-from matplotlib import pyplot as plt
-from tqdm import tqdm
+from matplotlib.figure import Figure
 
-from jscomb import james_stein, plots, progressive, rendering
+from experiments.common.command import Options, main
+from experiments.common.errors import relative_l2
+from experiments.common.report import Report
+from experiments.common.tables import table
+from jscomb import james_stein, progressive, rendering
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
-from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
 from jscomb.typing import Image
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to render.
 
     Attributes:
-        scene: cornell-box, cornell-glass, cornell-glossy, or a Mitsuba XML file.
-        out: folder of the pictures and the plot.
+        scene: name of a scene, see `jscomb.rendering`, or a Mitsuba XML file.
+        work: folder that keeps what is rendered.
         size: width and height in pixels.
         spp: budget, samples a pixel.
         first: samples a pixel of the first batch, at least two.
@@ -44,7 +43,7 @@ class Config:
     """
 
     scene: tyro.conf.Positional[str]
-    out: pathlib.Path
+    work: pathlib.Path
     size: int = 128
     spp: int = 2048
     first: int = 8
@@ -59,7 +58,7 @@ class Config:
 
 def stages(config: Config) -> Iterator[Frame]:
     """The frame after each batch of samples."""
-    config.out.mkdir(parents=True, exist_ok=True)
+    config.work.mkdir(parents=True, exist_ok=True)
     whole = rendering.Settings(
         spp=config.spp,
         size=config.size,
@@ -70,7 +69,7 @@ def stages(config: Config) -> Iterator[Frame]:
     before = [p for p in every if p.target != "color0"]
     color = [p for p in every if p.target == "color0"]
     due = config.first
-    todo, partial = [*before, *color], config.out / "frame.partial.npz"
+    todo, partial = [*before, *color], config.work / "frame.partial.npz"
     steps = rendering.render_steps(config.scene, whole, todo=todo, partial=partial)
     for done, moments in steps:
         samples = done - len(before)
@@ -98,13 +97,15 @@ def mixed(frame: Frame) -> dict[str, tuple[Image, Image]]:
 def errors(frame: Frame, image: Image, estimate: Image) -> tuple[float, float]:
     """Relative error of an image as it is, and as estimated."""
     assert frame.reference is not None
-    r, noise = frame.reference
-    radiance = jnp.mean(r, axis=-1, keepdims=True)
+    radiance = jnp.mean(frame.reference.image, axis=-1, keepdims=True)
     known = jnp.mean(estimate / (jnp.square(radiance) + 0.01))
-    return float(rel_l2(image, r, half_difference=noise)), float(known)
+    return relative_l2(image, frame), float(known)
 
 
-def run(config: Config) -> dict[int, dict[str, tuple[float, float]]]:
+Found = dict[int, dict[str, tuple[float, float]]]
+
+
+def run(config: Config) -> Found:
     """Render until the budget is spent or the error is small enough.
 
     Args:
@@ -112,42 +113,65 @@ def run(config: Config) -> dict[int, dict[str, tuple[float, float]]]:
 
     Returns:
         by samples a pixel and image, its error as it is and as estimated.
+
+    Raises:
+        ImportError: if Open Image Denoise or Mitsuba is missing.
+        ValueError: if the scene is unknown.
     """
-    found: dict[int, dict[str, tuple[float, float]]] = {}
+    if config.quick:
+        config = dataclasses.replace(config, size=24, spp=32, reference_spp=256)
+    found: Found = {}
     for frame in stages(config):
         assert frame.samples is not None
         samples, frame = int(frame.samples), frame.normalised()
         images = mixed(frame)
         found[samples] = {n: errors(frame, *pair) for n, pair in images.items()}
-        row = (f"{n} {a:.5f} ({b:.5f})" for n, (a, b) in found[samples].items())
-        tqdm.write(f"{samples} spp: " + ", ".join(row))
-        shown = {
-            name: image for name, (image, _) in images.items() if name != "samples"
-        }
-        plots.comparison(config.out / f"{samples:05d}.png", [(frame, shown)])
-        plot(config.out / "errors.png", found)
         if found[samples]["mixed"][1] < config.target:
             break
     return found
 
 
-def plot(path: pathlib.Path, found: dict[int, dict[str, tuple[float, float]]]) -> None:
+def plot(found: Found) -> Figure:
     """Errors against samples: as they are, and dashed as estimated."""
-    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axis = figure.subplots()
     for color, name in enumerate(next(iter(found.values()))):
         for style, label, at in (("-", name, 0), ("--", f"{name}, estimated", 1)):
             values = [row[name][at] for row in found.values()]
             axis.loglog(list(found), values, style, color=f"C{color}", label=label)
     axis.set(xlabel="samples a pixel", ylabel="relative L2")
     axis.legend()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    return figure
 
 
-def main() -> None:
-    """Run from the command line."""
-    run(tyro.cli(Config, description=__doc__))
+def report(found: Found) -> Report:
+    """Say what was found.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        errors and estimates of every stage, and their plot.
+    """
+    names = list(next(iter(found.values())))
+
+    def off(name: str) -> float:
+        """The largest factor between an estimate and the truth."""
+        ratios = [known / true for true, known in (row[name] for row in found.values())]
+        return max(max(r, 1 / r) if r > 0 else float("inf") for r in ratios)
+
+    gains = [row["mixed"][0] / row["denoised"][0] for row in found.values()]
+    answer = (
+        f"From {min(found)} to {max(found)} samples the estimated error is right "
+        f"within a factor of {off('samples'):.2f} for the samples, "
+        f"{off('denoised'):.1f} for the denoised and {off('mixed'):.1f} for the mixed "
+        f"image, which has {max(gains):.2f} of the denoised one's error at most and "
+        f"{gains[-1]:.2f} at the end."
+    )
+    header = ["samples", *(f"{n}{e}" for n in names for e in ("", ", estimated"))]
+    cells = [[s, *(v for n in names for v in row[n])] for s, row in found.items()]
+    return Report(answer, table(header, cells), {"Errors against samples": plot(found)})
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

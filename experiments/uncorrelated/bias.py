@@ -1,17 +1,13 @@
 """How much of the error of uncorrelated kernels and of others is bias?
 
-    python -m experiments.uncorrelated.bias OUT
-
 Hundreds of independent realisations of synthetic frames (`synthetic`) and of rendered
 ones: four sub-averages of independent and four of common random numbers, and four more
-independent ones for the methods that have no use for common numbers. Printed, with the
-standard error of the squared bias over groups of realisations:
+independent ones for the methods that have no use for common numbers. With the standard
+error of the squared bias over groups of realisations:
 
     bias^2, variance, error   means over pixels, relative to squared radiance
     skewness                  Pearson's median skewness of the correlated estimates and
                               of their differences within windows, mean of its size
-
-and OUT/bias.png, maps of the bias. Realisations are kept in OUT as they come.
 """
 
 import dataclasses
@@ -23,14 +19,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from jaxtyping import Array
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from experiments.data import synthetic
-from experiments.uncorrelated.uncorrelated import with_gradients
+from experiments.uncorrelated.error import with_gradients
 from jscomb import james_stein, uncorrelated
 from jscomb.denoisers import bilateral, oidn
 from jscomb.features import stack
@@ -57,26 +56,24 @@ _EPSILON = 0.01  # of the relative error, squared normalised radiance
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to render, and how often.
 
     Attributes:
-        out: folder for the realisations and the picture.
+        work: folder that keeps the realisations.
         groups: of realisations, at least 3; errors of means are judged by them.
         of_each: realisations in a group.
         samples: samples a pixel of one sub-average.
         size: width and height in pixels.
         window: width of the windows of methods with kernels.
-        quick: few realisations, one scene of each kind, narrow windows.
     """
 
-    out: tyro.conf.Positional[pathlib.Path]
+    work: tyro.conf.Positional[pathlib.Path]
     groups: int = 10
     of_each: int = 30
     samples: int = 16
     size: int = 96
     window: int = 15
-    quick: bool = False
 
     def __post_init__(self) -> None:
         """Groups are compared with each other."""
@@ -236,7 +233,7 @@ def kept(config: Config, name: str) -> list[Group]:
     else:
         make = lambda skip: rendered_groups(config, name, skip)
     size = f"{config.size}-{config.samples}-{config.of_each}-{config.window}"
-    files = [config.out / f"{name}-{size}-{k}.npz" for k in range(config.groups)]
+    files = [config.work / f"{name}-{size}-{k}.npz" for k in range(config.groups)]
     done = next((k for k, file in enumerate(files) if not file.exists()), len(files))
     for file, group in zip(files[done:], make(done), strict=True):
         np.savez(file, **group._asdict())
@@ -304,76 +301,106 @@ def skewness_of_differences(samples: np.ndarray, reach: int) -> float:
     return total / count
 
 
-def run(config: Config) -> dict[str, dict]:
+class Measured(NamedTuple):
+    """What is known of a frame.
+
+    Attributes:
+        methods: a summary each.
+        skewness: of the correlated estimates, and of their differences.
+        gamma: those chosen, and how often.
+    """
+
+    methods: dict[str, Summary]
+    skewness: tuple[float, float]
+    gamma: dict[float, int]
+
+
+def run(config: Config) -> dict[str, Measured]:
     """Make and measure all realisations.
 
     Args:
         config: what, and where to keep it.
 
     Returns:
-        by frame: `methods`, a `Summary` each; `skewness`, of the correlated estimates
-        and of their differences; `gamma`, those chosen and how often.
+        what is known, by frame.
+
+    Raises:
+        ImportError: if Open Image Denoise or Mitsuba is missing.
+        ValueError: if there is no LLVM for common random numbers.
     """
-    config.out.mkdir(parents=True, exist_ok=True)
+    config.work.mkdir(parents=True, exist_ok=True)
     names = [*SYNTHETIC, *RENDERED]
     if config.quick:
         config = dataclasses.replace(config, groups=3, of_each=4, size=24, window=5)
         names = [names[1], names[2]]
-    found = {}
-    for name in tqdm(names, unit="frame"):
-        groups = kept(config, name)
-        z = np.concatenate([g.correlated for g in groups])
-        values, counts = np.unique(
-            np.concatenate([g.gamma for g in groups]).round(6), return_counts=True
-        )
-        found[name] = {
-            "methods": {m: summary(groups, k) for k, m in enumerate(METHODS)},
-            "skewness": (float(skewness(z).mean()), skewness_of_differences(z, REACH)),
-            "gamma": dict(zip(values.tolist(), counts.tolist(), strict=True)),
-        }
-    _picture(config.out / "bias.png", found)
-    return found
+    return {name: measure(kept(config, name)) for name in tqdm(names, unit="frame")}
 
 
-def _picture(path: pathlib.Path, found: dict[str, dict]) -> None:
-    """Maps of the bias: a row for each frame, a column for each method."""
-    figure, axes = plt.subplots(
-        len(found),
-        len(METHODS),
-        figsize=(2 * len(METHODS), 2.3 * len(found)),
-        layout="compressed",
-        squeeze=False,
+def measure(groups: list[Group]) -> Measured:
+    """All that the groups of one frame say."""
+    z = np.concatenate([g.correlated for g in groups])
+    gamma = np.concatenate([g.gamma for g in groups]).round(6)
+    values, counts = np.unique(gamma, return_counts=True)
+    return Measured(
+        {m: summary(groups, k) for k, m in enumerate(METHODS)},
+        (float(skewness(z).mean()), skewness_of_differences(z, REACH)),
+        dict(zip(values.tolist(), counts.tolist(), strict=True)),
     )
+
+
+def maps(found: dict[str, Measured]) -> Figure:
+    """Maps of the bias: a row for each frame, a column for each method."""
+    size = 2 * len(METHODS), 2.3 * len(found)
+    figure = Figure(figsize=size, layout="compressed")
+    axes = figure.subplots(len(found), len(METHODS), squeeze=False)
     for row, (name, result) in zip(axes, found.items(), strict=True):
-        for axis, (method, one) in zip(row, result["methods"].items(), strict=True):
-            axis.imshow(one.map, cmap="RdBu_r", vmin=-0.1, vmax=0.1)
+        for axis, (method, one) in zip(row, result.methods.items(), strict=True):
+            drawn = axis.imshow(100 * one.map, cmap="RdBu_r", vmin=-10, vmax=10)
             axis.set_title(f"{method}\n{one.bias:.1e}", fontsize=8)
             axis.set_xticks([])
             axis.set_yticks([])
         row[0].set_ylabel(name, fontsize=8)
-    note = "relative bias, blue -10 % to red 10 %; above: its mean square"
-    figure.supxlabel(note, fontsize=9)
-    figure.savefig(path, dpi=60)
-    plt.close(figure)
+    figure.colorbar(drawn, ax=axes, label="relative bias, %; above: its mean square")
+    return figure
 
 
-def main() -> None:
-    """Print the tables."""
-    found = run(tyro.cli(Config, description=__doc__))
+def report(found: dict[str, Measured]) -> Report:
+    """Say what was found.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        a table and a row of maps for each frame.
+    """
+
+    def said(name: str, methods: dict[str, Summary]) -> str:
+        ours, denoised = methods["uncorrelated"], methods["oidn"]
+        share = max(ours.bias, 0) / (max(ours.bias, 0) + ours.variance)
+        return f"{share:.0%} of the error on {name} ({ours.bias / denoised.bias:.2g})"
+
+    each = "; ".join(said(name, result.methods) for name, result in found.items())
+    answer = (
+        "Squared bias of uncorrelated kernels, and in brackets its ratio to that of "
+        f"Open Image Denoise: {each}."
+    )
+    header = "bias^2", "its standard error", "/ uncorrelated's", "variance", "error"
+    parts = []
     for name, result in found.items():
-        ours = result["methods"]["uncorrelated"].bias
-        print(f"\n| {name} | bias^2 | its standard error | / uncorrelated's ", end="")
-        print("| variance | error |\n" + "| --- " * 6 + "|")
-        for method, s in result["methods"].items():
-            cells = [f"{s.bias:.2e}", f"{s.bias_error:.1e}", f"{s.bias / ours:.3g}"]
-            cells += [f"{s.variance:.5f}", f"{s.bias + s.variance:.5f}"]
-            print(f"| {method} |", " | ".join(cells), "|")
-        of_z, of_differences = result["skewness"]
-        print(
-            f"\nskewness {of_z:.3f}, of differences {of_differences:.3f} "
-            f"({of_z / of_differences:.2f} times less); gamma {result['gamma']}"
+        ours = result.methods["uncorrelated"].bias
+        cells = [
+            [m, s.bias, s.bias_error, s.bias / ours, s.variance, s.bias + s.variance]
+            for m, s in result.methods.items()
+        ]
+        of_z, of_differences = result.skewness
+        chosen = ", ".join(f"{g:g} ({n} times)" for g, n in result.gamma.items())
+        parts.append(table([name, *header], cells))
+        parts.append(
+            f"Skewness {of_z:.3f}, of differences {of_differences:.3f} "
+            f"({of_z / of_differences:.2f} times less); gamma {chosen}."
         )
+    return Report(answer, "\n\n".join(parts), {"Maps of the bias": maps(found)})
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

@@ -1,9 +1,7 @@
 """How alike is the noise of neighbouring pixels under common random numbers?
 
-    python -m experiments.uncorrelated.correlation [SCENE ...]
-
 Renders single samples of each scene with independent numbers, with common ones, and
-with common ones in tiles, and prints for horizontal and vertical neighbours
+with common ones in tiles. For horizontal and vertical neighbours:
 
     correlation   of their noise: median over pairs of pixels, and over the whole frame,
                   where the noisiest decide
@@ -23,11 +21,14 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from jscomb.rendering import SCENES, Launcher, Moments, Pass, Settings
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to render.
 
     Attributes:
@@ -35,14 +36,12 @@ class Config:
         size: width and height in pixels.
         passes: single samples a pixel of each kind.
         tile: width in pixels of the tiles.
-        quick: one scene, small, few passes.
     """
 
     scenes: tyro.conf.Positional[tuple[str, ...]] = SCENES
     size: int = 192
     passes: int = 256
     tile: int = 16
-    quick: bool = False
 
 
 class Noise(NamedTuple):
@@ -133,18 +132,31 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     return rows
 
 
-def main() -> None:
-    """Print the table."""
-    config = tyro.cli(Config, description=__doc__)
-    rows = run(config)
-    columns = list(list(rows.values())[-1])
-    print(
-        "| numbers |", " | ".join(columns), "|\n" + "| --- " * (len(columns) + 1) + "|"
+def report(rows: dict[str, dict[str, float]]) -> Report:
+    """Say what was found.
+
+    Args:
+        rows: by `run`.
+
+    Returns:
+        every scene with all kinds of numbers.
+    """
+    common = [row for name, row in rows.items() if name.endswith(", common")]
+
+    def span(column: str) -> str:
+        each = [row[column] for row in common]
+        return f"{min(each):.2f} to {max(each):.2f}"
+
+    answer = (
+        "Under common random numbers the variance of neighbours' difference is "
+        f"{span('ratio, median')} of the sum of both variances (median over pixels, "
+        f"{len(common)} scenes); over whole frames, where the noisiest decide, "
+        f"{span('ratio, frame')}."
     )
-    for name, row in rows.items():
-        cells = (f"{row[c]:.3f}" if c in row else "" for c in columns)
-        print(f"| {name} |", " | ".join(cells), "|")
+    columns = list(list(rows.values())[-1])
+    cells = [[name, *(row.get(c) for c in columns)] for name, row in rows.items()]
+    return Report(answer, table(["numbers", *columns], cells))
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.uncorrelated import bias, correlation, uncorrelated
-from jscomb import exr, metrics
+from experiments.uncorrelated import bias, correlation, error
+from jscomb import metrics, rendering
 
 BOX = """<scene version="3.0.0">
   <integrator type="path"/>
@@ -31,17 +31,23 @@ def test_uncorrelated_kernels_are_measured(tmp_path, vectorised):
     reference = np.full((12, 16, 3), 0.7, np.float32)
     noise = 0 * reference
     np.savez(tmp_path / "box.npz", reference=reference, reference_half_difference=noise)
-    config = uncorrelated.Config(tmp_path, tmp_path, tmp_path / "out", quick=True)
-    found = uncorrelated.run(config)
+    config = error.Config(tmp_path, tmp_path, tmp_path / "out", quick=True)
+    found = error.run(config)
     row = found["frames"]["box 8"]
     assert all(np.isfinite(list(each.values())).all() for each in row.values())
-    image = exr.read_frame(tmp_path / "out" / "box-8-common.exr").color
+    settings = rendering.Settings(
+        spp=8, width=16, height=12, buffers=4, numbers="common", seed=error.COMMON_SEED
+    )
+    scene = tmp_path / "box" / "scene.xml"
+    image = rendering.render(f"{scene}", settings).color
     expected = metrics.rel_l2(image, jnp.asarray(reference))
     np.testing.assert_allclose(row["error"]["common numbers"], expected, rtol=0.05)
-    assert uncorrelated.run(config)["frames"] == found["frames"]  # kept
+    assert error.run(config)["frames"] == found["frames"]  # kept
     assert found["speed"].keys() == {"7x7"}
+    ratio = row["error"]["uncorrelated 7x7"] / row["error"]["path tracing"]
+    assert f"(geometric mean of 1 frames), {ratio:.2f} (" in error.report(found).answer
     with pytest.raises(ValueError, match=r"no scene in .* has an archive in"):
-        uncorrelated.run(uncorrelated.Config(tmp_path, tmp_path / "out", tmp_path))
+        error.run(error.Config(tmp_path, tmp_path / "out", tmp_path))
 
 
 def test_bias_is_that_of_known_groups():
@@ -67,12 +73,14 @@ def test_bias_of_all_methods(tmp_path, vectorised):
     found = bias.run(config)
     assert len(found) == 2
     for result in found.values():
-        assert result["methods"].keys() == set(bias.METHODS)
-        for one in result["methods"].values():
+        assert result.methods.keys() == set(bias.METHODS)
+        for one in result.methods.values():
             assert np.isfinite([one.bias, one.bias_error, one.variance]).all()
             assert one.map.shape == (24, 24)
-        assert sum(result["gamma"].values()) == 12
-    assert (tmp_path / "bias.png").stat().st_size > 10_000
+        assert sum(result.gamma.values()) == 12
+    said = bias.report(found)
+    assert f"{found['cornell-glass'].methods['oidn'].bias:.3g}" in said.body
+    assert list(said.figures) == ["Maps of the bias"]
     with pytest.raises(ValueError, match="at least 3 groups of 2 realisations"):
         bias.Config(tmp_path, groups=2)
 
@@ -83,3 +91,5 @@ def test_likeness_of_neighbours(vectorised):
     assert abs(alone["correlation, median"]) < 0.2 < 0.5 < common["correlation, median"]
     assert common["ratio, median"] < 0.5 < 0.8 < alone["ratio, median"]
     assert abs(common["frame's mean, standard errors"]) < 5
+    said = correlation.report(rows).answer
+    assert f"is {common['ratio, median']:.2f} to" in said

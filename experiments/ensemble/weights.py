@@ -1,7 +1,5 @@
 """What does an ensemble of denoisers gain, and by which part of it?
 
-    python -m experiments.ensemble.ensemble FOLDER --results FILE.json
-
 Every archive in the folder (`archives`), at every sample count. Bases: Open Image
 Denoise with and without features, joint bilateral, Gaussian, non-local means and RDFC;
 and the unbiased image. Relative L2, less the reference's noise, of normalised frames,
@@ -23,35 +21,36 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments.common import archives
+from experiments.common import archives, errors
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from experiments.common.timing import medians
 from experiments.ensemble.bases import BASES, bases_of, unbiased_of
 from jscomb import ensemble
 from jscomb.denoisers import nonlocal_means
 from jscomb.frame import Frame
-from jscomb.metrics import rel_l2
 from jscomb.numerics import simplex
 from jscomb.typing import Image
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to measure.
 
     Attributes:
         folder: of NumPy archives.
         results: file that results are kept in; None to keep none.
-        quick: only the first archive, at its least sample count.
+        repeats: timed calls of each method.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
     results: pathlib.Path | None = None
-    quick: bool = False
+    repeats: int = 3
 
 
-SCALED = {"solver": "multi-scale", "filter": False}
-
-means = jax.jit(nonlocal_means.denoise)
+PAPER, OURS, SELECTED = "pixel, filtered (the paper)", "multi-scale", "selected"
+SECONDS = ", seconds"
 
 
 def combined(**options) -> Callable:
@@ -104,16 +103,16 @@ def smooth(images, a, b, albedo, normal):
 @jax.jit
 def one_hot_bilateral(full, a, b, xa, xb, v, albedo, normal):
     """The base of least error, errors filtered like weights."""
-    errors = smooth(errors_of(a, b, xa, xb), a, b, albedo, normal)
-    return ensemble.average(full, ensemble.one_hot(errors))
+    found = smooth(errors_of(a, b, xa, xb), a, b, albedo, normal)
+    return ensemble.average(full, ensemble.one_hot(found))
 
 
 @jax.jit
 def one_hot_means(full, a, b, xa, xb, v, albedo, normal):
     """The base of least error, errors filtered by non-local means."""
-    errors = jnp.moveaxis(errors_of(a, b, xa, xb), 0, 2)
-    flat = errors.reshape(*xa.shape[:2], -1)
-    filtered = means(flat, (xa + xb) / 2, v).reshape(errors.shape)
+    found = jnp.moveaxis(errors_of(a, b, xa, xb), 0, 2)
+    flat = found.reshape(*xa.shape[:2], -1)
+    filtered = nonlocal_means.denoise(flat, (xa + xb) / 2, v).reshape(found.shape)
     return ensemble.average(full, ensemble.one_hot(jnp.moveaxis(filtered, 2, 0)))
 
 
@@ -132,52 +131,29 @@ METHODS = {
     "one-hot, weights filtered": one_hot_after,
     "one-hot, 31x31": weighed(one_hot(31)),
     "pixel (the paper), no filter": combined(filter=False),
-    "pixel, filtered (the paper)": combined(),
+    PAPER: combined(),
     **{f"{w}x{w}": weighed(over(w)) for w in (7, 15, 31, 63)},
     "frame": weighed(over(whole_frame=True)),
-    "multi-scale": combined(**SCALED),
+    OURS: combined(solver="multi-scale", filter=False),
     "multi-scale, filtered": combined(solver="multi-scale"),
-    "multi-scale, each channel": combined(**SCALED, shared=False),
+    "multi-scale, each channel": combined(
+        solver="multi-scale", filter=False, shared=False
+    ),
     "31x31, either sign": weighed(
         lambda *halves: simplex.affine(
             ensemble.error_matrix(*halves, windows=(31,), whole_frame=False)
         )
     ),
 }
-WITH_UNBIASED = (
-    "pixel, filtered (the paper)",
-    "31x31",
-    "frame",
-    "multi-scale",
-    "multi-scale, filtered",
-)
-SECONDS = ", seconds"
-SHOWN = (
-    "average",
-    "one-hot, 31x31",
-    "pixel (the paper), no filter",
-    "pixel, filtered (the paper)",
-    "7x7",
-    "15x15",
-    "31x31",
-    "63x63",
-    "frame",
-    "multi-scale",
-    "multi-scale, filtered",
-    "multi-scale and x",
-    "multi-scale, filtered and x",
-    "selected",
-)
+WITH_UNBIASED = PAPER, "31x31", "frame", OURS, "multi-scale, filtered"
+ALL = *METHODS, *(f"{name} and x" for name in WITH_UNBIASED), SELECTED
 
 
-def measure(frame: Frame) -> dict[str, float]:
-    """Relative L2 of the bases, of all methods with their time, and of all subsets."""
-    assert frame.reference is not None
-    r, noise = frame.reference
-    error = lambda image: float(rel_l2(image, r, half_difference=noise))
+def measure(frame: Frame, repeats: int) -> dict[str, float]:
+    """Errors of the bases, of all methods with their time, and of all subsets."""
     x_a, x_b = (half.color for half in frame.halves())
     rest = x_a, x_b, frame.variance, frame.albedo, frame.normal
-    bases = bases_of(frame)
+    bases, error = bases_of(frame), functools.partial(errors.relative_l2, frame=frame)
     row = {"path tracing": error(frame.color)}
     row |= {name: error(base.image) for name, base in bases.items()}
     some = ensemble.stack_estimates(bases)
@@ -186,20 +162,22 @@ def measure(frame: Frame) -> dict[str, float]:
     def add(name: str, method: Callable, images: Sequence[Image]) -> None:
         call = functools.partial(method, *images, *rest)
         row[name] = error(call())
-        row[name + SECONDS] = medians({name: call}, 3)[name]
+        row[name + SECONDS] = medians({name: call}, repeats)[name]
 
     for name, method in METHODS.items():
         add(name, method, some)
         if name in WITH_UNBIASED:
             add(f"{name} and x", method, more)
-    ours, names = METHODS["multi-scale"], list(BASES)
+    ours, names = METHODS[OURS], list(BASES)
     for count in range(2, len(names)):
         for subset in itertools.combinations(names, count):
             images = ensemble.stack_estimates({name: bases[name] for name in subset})
             row[" + ".join(subset)] = error(ours(*images, *rest))
-    chosen = ensemble.select_bases(some.biased_a, some.biased_b, x_a, x_b).kept
+    select = lambda: ensemble.select_bases(some.biased_a, some.biased_b, x_a, x_b)
+    chosen = select().kept
     needed = {names[k]: bases[names[k]] for k in chosen}
-    add("selected", ours, ensemble.stack_estimates(needed))
+    add(SELECTED, ours, ensemble.stack_estimates(needed))
+    row["selecting" + SECONDS] = medians({"": lambda: select().kept}, 1)[""]
     row["selected, number"] = len(chosen)
     return row
 
@@ -211,17 +189,23 @@ def run(config: Config) -> dict[str, dict[str, float]]:
         config: what to measure.
 
     Returns:
-        relative L2 by "frame samples" and method.
+        errors and seconds by "frame samples" and method.
 
     Raises:
         ValueError: if the folder holds no archive.
     """
+    of = functools.partial(measure, repeats=1 if config.quick else config.repeats)
     return archives.measured(
-        config.folder, {"": measure}, results=config.results, quick=config.quick
+        config.folder, {"": of}, results=config.results, quick=config.quick
     )
 
 
-def scores(rows: Sequence[dict[str, float]], names: Sequence[str]) -> dict[str, float]:
+def best(row: errors.Row) -> float:
+    """Error of the best base."""
+    return min(row[base] for base in BASES)
+
+
+def scores(rows: Sequence[errors.Row], names: Sequence[str]) -> dict[str, float]:
     """Mean score of each candidate: as many as there are for the best, 1 for the worst.
 
     Args:
@@ -231,79 +215,80 @@ def scores(rows: Sequence[dict[str, float]], names: Sequence[str]) -> dict[str, 
     Returns:
         the scores by name, the best first.
     """
-    errors = np.array([[row[name] for name in names] for row in rows])
-    ranks = errors.argsort(axis=1).argsort(axis=1)
+    each = np.array([[row[name] for name in names] for row in rows])
+    ranks = each.argsort(axis=1).argsort(axis=1)
     mean = (len(names) - ranks).mean(axis=0)
-    order = (-mean).argsort()
-    return {names[k]: float(mean[k]) for k in order}
+    found = dict(zip(names, mean.tolist(), strict=True))
+    return dict(sorted(found.items(), key=lambda each: -each[1]))
 
 
-def main() -> None:
-    """Print the tables."""
-    found = run(tyro.cli(Config, description=__doc__))
-    rows = list(found.values())
-    print_means(found)
-    print_frames(found)
-    print_scores(found)
-    number = np.mean([row["selected, number"] for row in rows])
-    share = np.median(
-        [r["selected" + SECONDS] / r["multi-scale" + SECONDS] for r in rows]
-    )
-    print(f"\nselected: {number:.1f} of {len(BASES)} bases, {share:.2f} of the time")
-
-
-def ratio(row: dict[str, float], name: str) -> float:
-    """Error divided by that of the best base."""
-    return row[name] / min(row[base] for base in BASES)
-
-
-def by_count(found: dict[str, dict[str, float]]) -> dict[int, list[dict[str, float]]]:
-    """The frames' errors by sample count, ascending."""
-    counts = sorted({int(name.split()[-1]) for name in found})
-    return {c: [r for n, r in found.items() if n.endswith(f" {c}")] for c in counts}
-
-
-def print_means(found: dict[str, dict[str, float]]) -> None:
-    """Geometric means over frames, the worst frame, and time."""
-    at, rows = by_count(found), list(found.values())
-    print("| error / best base |", " | ".join(map(str, at)), "| worst | time |")
-    print("| --- " * (len(at) + 3) + "|")
-    with_x = [f"{name} and x" for name in WITH_UNBIASED]
-    for name in (*BASES, *METHODS, *with_x, "selected"):
-        ratios = [[ratio(row, name) for row in some] for some in at.values()]
-        means_of = " | ".join(f"{np.exp(np.mean(np.log(r))):.3f}" for r in ratios)
-        own = [
-            r[name + SECONDS] / r["average" + SECONDS]
-            for r in rows
-            if name not in BASES
-        ]
-        time = f"{np.median(own):.0f}" if own else ""
-        print(f"| {name} | {means_of} | {max(map(max, ratios)):.2f} | {time} |")
-
-
-def print_frames(found: dict[str, dict[str, float]]) -> None:
-    """Every frame: errors of the bases, and what the ensembles make of them."""
-    names = [n for n in SHOWN if n in next(iter(found.values()))]
-    columns = ["frame", "path tracing", *BASES, *names]
-    print("\n|", " | ".join(columns), "|\n" + "| --- " * len(columns) + "|")
-    for frame, row in found.items():
-        bases = " | ".join(f"{row[base]:.5f}" for base in ("path tracing", *BASES))
-        ratios = " | ".join(f"{ratio(row, name):.3f}" for name in names)
-        print(f"| {frame} | {bases} | {ratios} |")
-
-
-def print_scores(found: dict[str, dict[str, float]]) -> None:
+def scored(rows: dict[str, dict[str, float]]) -> str:
     """Every subset of the bases, the best first."""
-    at, rows = by_count(found), list(found.values())
-    subsets = [n for n in rows[0] if " + " in n] + [*BASES, "multi-scale"]
-    print("\n| bases | score |", " | ".join(map(str, at)), "|")
-    print("| --- " * (len(at) + 2) + "|")
-    each = [scores(some, subsets) for some in at.values()]
-    for name, score in scores(rows, subsets).items():
-        shown = "all six" if name == "multi-scale" else name
-        parts = " | ".join(f"{scored[name]:.1f}" for scored in each)
-        print(f"| {shown} | {score:.1f} | {parts} |")
+    every, groups = list(rows.values()), errors.by_samples(rows)
+    subsets = [n for n in every[0] if " + " in n] + [*BASES, OURS]
+    each = [scores(some, subsets) for some in groups.values()]
+    cells = (
+        ["all six" if name == OURS else name, score, *(s[name] for s in each)]
+        for name, score in scores(every, subsets).items()
+    )
+    return table(["bases", "score", *groups], cells)
+
+
+def report(rows: dict[str, dict[str, float]]) -> Report:
+    """Say what was found.
+
+    Args:
+        rows: by `run`.
+
+    Returns:
+        means beside times, every frame, and scores of all subsets.
+    """
+    every, groups = list(rows.values()), errors.by_samples(rows)
+
+    def time(name: str, unit: str = "average") -> float | None:
+        if name in BASES:
+            return None
+        return float(np.median([r[name + SECONDS] / r[unit + SECONDS] for r in every]))
+
+    def said(name: str) -> str:
+        ratios = [[row[name] / best(row) for row in g] for g in groups.values()]
+        means = ", ".join(f"{errors.geometric_mean(g):.2f}" for g in ratios)
+        return f"{means} (worst {max(map(max, ratios)):.2f})"
+
+    number = np.mean([row["selected, number"] for row in every])
+    answer = (
+        f"At {', '.join(map(str, groups))} samples an ensemble of {len(BASES)} bases "
+        f"has, in relative L2 divided by the best base's (geometric means of "
+        f"{len(rows)} frames in all), {said(OURS)} with multi-scale weights in "
+        f"{time(OURS):.0f} times the plain average's time; {said(SELECTED)} with the "
+        f"{number:.1f} bases that `select_bases` leaves in {time(SELECTED):.0f} times, "
+        f"selecting takes {time('selecting', OURS):.1f} times as long as combining all "
+        f"six; {said('31x31')} with weights over 31x31 pixels; and {said(PAPER)} with "
+        f"the paper's of single pixels, filtered, in {time(PAPER):.0f} times."
+    )
+    shown = [n for n in ALL if not n.startswith("one-hot, e") and n != "average"]
+    frames = (
+        [frame, *(row[n] for n in ("path tracing", *BASES))]
+        + [row[n] / best(row) for n in shown]
+        for frame, row in rows.items()
+    )
+    tables = [
+        errors.means(
+            rows,
+            [*BASES, *ALL],
+            best,
+            title="error / best base",
+            beside={"time / average": time},
+        ),
+        "Every frame: errors of path tracing and of the bases, then ratios to the best "
+        "base.",
+        table(["frame", "path tracing", *BASES, *shown], frames),
+        "Scores of all subsets with multi-scale weights: as many as there are subsets "
+        "for the best of a frame, 1 for the worst; means over frames.",
+        scored(rows),
+    ]
+    return Report(answer, "\n\n".join(tables))
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

@@ -1,41 +1,46 @@
 """What is double shrinkage of path tracing and photon mapping worth, at equal time?
 
-    python -m experiments.double_shrinkage.double_shrinkage OUT
-
 Every scene is rendered twice: path tracing and photon mapping for a given time each, to
-be used alone, and both for half of it each, to be combined. Three tables:
+be used alone, and both for half of it each, to be combined. Four tables:
 
-    error      relative L2, less the reference's noise, with the seconds of sampling
-               and of combining
+    error      relative L2, less the reference's noise, and the seconds of combining
     ablations  double shrinkage with another prior (y*, James-Stein's cross-regressed
                image), or James-Stein in its place
     mse        the photon-mapped image's mean squared error as halves and as radii tell
                it, and the true one: mean over the frame, and over its darkest and
                brightest quarter, by the reference
-
-and OUT/SCENE.png, pictures with maps of k1 and k2.
+    time       of the prior, divided by that of its parts timed alone (three kinds of
+               weights, twice the products of features and their matrix product, once
+               the predictions' product); of the rest, divided by reading the same
+               images once and writing one, and by the bare window sums where it pools
 """
 
 import dataclasses
 import functools
-import json
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from jscomb import double_shrinkage, ensemble, exr, james_stein, rendering
-from jscomb.cli import render_file
+from experiments.common.command import Options, main
+from experiments.common.errors import relative_l2
+from experiments.common.report import Report
+from experiments.common.results import Results
+from experiments.common.tables import table
+from experiments.common.timing import medians
+from experiments.double_shrinkage import speed
+from jscomb import double_shrinkage, ensemble, james_stein, rendering
 from jscomb.denoisers import oidn
 from jscomb.features import stack
-from jscomb.frame import Frame, Reference
-from jscomb.metrics import rel_l2, tone_map
+from jscomb.frame import Frame
+from jscomb.metrics import tone_map
 from jscomb.rendering import PHOTONS, Launcher, Pass, Settings
 from jscomb.typing import Image
 
@@ -44,28 +49,30 @@ WHITENED = {"window": 7, "whiten": True}
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to render and to measure.
 
     Attributes:
-        out: folder for frames, results and pictures.
+        work: folder that keeps what is rendered.
         scenes: names of own scenes, or XML files.
         seconds: of sampling, for each method.
         size: width and height in pixels.
         reference_spp: samples a pixel of the reference.
         photons: in each photon pass.
         radius: of the first photon passes; 0 for the default.
-        quick: one scene, small and short.
+        repeats: timed calls of each method.
+        timed_size: width and height in pixels of the images of the table of times.
     """
 
-    out: tyro.conf.Positional[pathlib.Path]
+    work: tyro.conf.Positional[pathlib.Path]
     scenes: tuple[str, ...] = ("cornell-caustic", "cornell-glass", "cornell-box")
     seconds: float = 16.0
     size: int = 128
     reference_spp: int = 16384
     photons: int = 200_000
     radius: float = 0.0
-    quick: bool = False
+    repeats: int = 5
+    timed_size: int = 1024
 
 
 def rates(config: Config, scene: str) -> tuple[float, float]:
@@ -97,44 +104,60 @@ def _settings(config: Config, spp: int, passes: int, **changes) -> Settings:
     )
 
 
-def frames(config: Config, scene: str, kept: dict) -> tuple[Frame, Frame, Image]:
-    """Frames of the whole and of half the time, and the latter's weighted photons."""
-    if "rates" not in kept:
-        kept["rates"] = rates(config, scene)
-    # The half has two buffers of two samples at least.
-    counts = [max(8, 4 * round(config.seconds / s / 4)) for s in kept["rates"]]
+class Rendered(NamedTuple):
+    """A scene in equal time.
+
+    Attributes:
+        whole: path tracing and photon mapping in all the time, each.
+        half: both in half of it.
+        bias: of the half's photon-mapped image as its radii tell, squared radiance.
+        samples: a pixel of the whole.
+        passes: of photons of the whole.
+    """
+
+    whole: Frame
+    half: Frame
+    bias: Image
+    samples: int
+    passes: int
+
+
+def rendered(config: Config, scene: str) -> Rendered:
+    """Render a scene, or take what a run has left; normalised."""
     name = pathlib.Path(scene).parent.name if scene.endswith(".xml") else scene
-    whole, half = (config.out / f"{name}-{which}.exr" for which in ("whole", "half"))
-    if not whole.exists():
-        settings = _settings(config, *counts, reference_spp=config.reference_spp)
-        render_file(scene, whole, settings)
-    weighted = half.with_suffix(".npz")
-    if not weighted.exists():
-        settings = _settings(config, *(n // 2 for n in counts), seed=SEED)
-        partial = half.with_suffix(".partial.npz")
-        *_, (_, moments) = rendering.render_steps(scene, settings, partial=partial)
-        each = [moments[f"{PHOTONS}{k}"].mean[..., 3:] for k in range(2)]
-        frame = rendering.assemble(settings, moments)
-        reference = exr.read_frame(whole).reference
-        about = rendering.provenance(scene, settings) | {"reference_from": whole.name}
-        exr.write_frame(half, frame._replace(reference=reference), provenance=about)
-        np.savez(weighted, mean=np.mean(each, axis=0), passes=settings.passes)
-        partial.unlink()
-    with np.load(weighted) as data:
-        mean, number = jnp.asarray(data["mean"], jnp.float32), int(data["passes"])
-    kept |= {"spp": counts[0], "passes": counts[1]}
-    every = rendering.plan_passes(_settings(config, 4, number))
-    radii = [p.radius for p in every if p.integrator == PHOTONS]
-    radii = jnp.asarray(radii, mean.dtype)
-    photons = exr.read_frame(half).estimates[PHOTONS].image
-    bias = double_shrinkage.radius_bias(photons, mean, radii)
-    return exr.read_frame(whole), exr.read_frame(half), bias
+    kept = Results(config.work / "rates.jsonl")
+    each = kept.get(f"{name} {config.size}", lambda: rates(config, scene))
+    # The half has two buffers of two samples at least.
+    counts = [max(8, 4 * round(config.seconds / seconds / 4)) for seconds in each]
+    settings = _settings(config, *counts, reference_spp=config.reference_spp)
+    partial = config.work / f"{name}-whole.npz"
+    whole = rendering.render(scene, settings, partial=partial)
+    settings = _settings(config, *(n // 2 for n in counts), seed=SEED)
+    partial = config.work / f"{name}-half.npz"
+    *_, (_, moments) = rendering.render_steps(scene, settings, partial=partial)
+    half = rendering.assemble(settings, moments)._replace(reference=whole.reference)
+    weighted = np.mean([moments[f"{PHOTONS}{k}"].mean[..., 3:] for k in range(2)], 0)
+    every = rendering.plan_passes(settings)
+    radii = jnp.asarray([p.radius for p in every if p.integrator == PHOTONS])
+    whole = whole.normalised()
+    whole = whole.with_estimate("oidn", oidn.denoise_frame(whole))
+    half, unit = half.normalised(whole.unit), whole.unit
+    assert unit is not None
+    bias = double_shrinkage.radius_bias(
+        half.estimates[PHOTONS].image,
+        jnp.asarray(weighted, half.color.dtype) / unit,
+        radii.astype(half.color.dtype),
+    )
+    return Rendered(whole, half, bias, *counts)
 
 
 def methods(whole: Frame, half: Frame) -> dict[str, Callable[[], Image]]:
     """All images by name; those of half the time unless they say alone."""
     u, b = half.color, half.estimates[PHOTONS]
+    assert b.halves is not None
     v = james_stein.robust_variance(half.variance)
+    assert b.halves is not None
+    y_a, y_b = b.halves
     x_a, x_b = (part.color for part in half.halves())
     inputs = lambda: double_shrinkage.make_inputs(half, b)
 
@@ -147,7 +170,7 @@ def methods(whole: Frame, half: Frame) -> dict[str, Callable[[], Image]]:
     def of_bases() -> Image:
         bases = [
             jnp.stack([i, j])
-            for i, j in zip((b.image, *b.halves), (u, x_a, x_b), strict=True)
+            for i, j in zip((b.image, y_a, y_b), (u, x_a, x_b), strict=True)
         ]
         return _ensemble(*bases, x_a, x_b)
 
@@ -187,6 +210,7 @@ _ensemble = jax.jit(
 def ablations(half: Frame) -> dict[str, Image]:
     """Figures 14 and 15: the prior swapped for y*, and the combiner for James-Stein."""
     u, b = half.color, half.estimates[PHOTONS]
+    assert b.halves is not None
     found = double_shrinkage.make_inputs(half, b)
     v = james_stein.robust_variance(half.variance)
     a_frame, b_frame = half.halves()
@@ -219,17 +243,12 @@ def ablations(half: Frame) -> dict[str, Image]:
     }
 
 
-def error_of(reference: Reference, image: Image) -> float:
-    """Relative L2, less the reference's noise."""
-    r, noise = reference
-    return float(rel_l2(image, r, half_difference=noise))
-
-
 def errors_of_photons(half: Frame, bias: Image) -> dict[str, list[float]]:
     """Estimated and true mean squared error, relative: frame, dark and bright."""
     assert half.reference is not None
     r, noise = half.reference
     b = half.estimates[PHOTONS]
+    assert b.halves is not None
     x_a, x_b = (part.color for part in half.halves())
     variance = jnp.square(b.halves[0] - b.halves[1]) / 4
     own = 0 if noise is None else jnp.square(noise) / 4
@@ -249,47 +268,81 @@ def errors_of_photons(half: Frame, bias: Image) -> dict[str, list[float]]:
     }
 
 
-def run(config: Config) -> dict[str, dict]:
+class Measured(NamedTuple):
+    """What is known of a scene.
+
+    Attributes:
+        error: by method.
+        seconds: of combining, by method.
+        ablations: error by method.
+        mse: of the photons by way, of the frame and its dark and bright parts.
+        samples: a pixel of path tracing alone.
+        passes: of photon mapping alone.
+        picture: of the images and shares.
+    """
+
+    error: dict[str, float]
+    seconds: dict[str, float]
+    ablations: dict[str, float]
+    mse: dict[str, list[float]]
+    samples: int
+    passes: int
+    picture: Figure
+
+
+class Found(NamedTuple):
+    """What was measured: of each scene, and the ratios of times."""
+
+    scenes: dict[str, Measured]
+    times: dict[str, float]
+
+
+def measure(scene: Rendered, repeats: int) -> Measured:
+    """All tables of one scene."""
+    whole, half, bias, samples, passes = scene
+    error = functools.partial(relative_l2, frame=whole)
+    calls = methods(whole, half)
+    images = {name: make() for name, make in calls.items()}
+    return Measured(
+        {name: error(image) for name, image in images.items()},
+        medians(calls, repeats),
+        {name: error(image) for name, image in ablations(half).items()},
+        errors_of_photons(half, bias),
+        samples,
+        passes,
+        picture(whole, half, images),
+    )
+
+
+def run(config: Config) -> Found:
     """Render and measure everything.
 
     Args:
         config: what, and where to keep it.
 
     Returns:
-        by scene: `error` and `seconds` by method, `ablations`, `mse`, and `rates`,
-        `spp` and `passes`.
+        tables by scene, and times.
+
+    Raises:
+        ImportError: if Open Image Denoise or Mitsuba is missing.
+        ValueError: if the scene is unknown, or there is no LLVM for photon mapping.
     """
     if config.quick:
         config = dataclasses.replace(
             config, scenes=config.scenes[:1], seconds=0.2, size=24, reference_spp=64,
-            photons=5000, radius=0.1,
+            photons=5000, radius=0.1, repeats=1, timed_size=64,
         )  # fmt: skip
-    config.out.mkdir(parents=True, exist_ok=True)
-    results = config.out / "results.json"
-    kept = json.loads(results.read_text()) if results.exists() else {}
-    for scene in tqdm(config.scenes, unit="scene"):
-        row = kept.setdefault(scene, {})
-        whole, half, bias = frames(config, scene, row)
-        results.write_text(json.dumps(kept, indent=1))
-        whole = whole.normalised()
-        half, bias = half.normalised(whole.unit), bias / whole.unit**2
-        error = functools.partial(error_of, whole.reference)
-        images, row["error"], row["seconds"] = {}, {}, {}
-        for name, make in methods(whole, half).items():
-            images[name] = jax.block_until_ready(make())
-            start = time.perf_counter()
-            jax.block_until_ready(make())
-            row["seconds"][name] = time.perf_counter() - start
-            row["error"][name] = error(images[name])
-        row["ablations"] = {n: error(i) for n, i in ablations(half).items()}
-        row["mse"] = errors_of_photons(half, bias)
-        _picture(config.out / f"{scene}.png", whole, half, images)
-        results.write_text(json.dumps(kept, indent=1))
-    return {scene: kept[scene] for scene in config.scenes}
+    config.work.mkdir(parents=True, exist_ok=True)
+    scenes = {
+        scene: measure(rendered(config, scene), config.repeats)
+        for scene in tqdm(config.scenes, unit="scene")
+    }
+    return Found(scenes, speed.ratios(config.timed_size, config.repeats))
 
 
-def _picture(path: pathlib.Path, whole: Frame, half: Frame, images: dict) -> None:
+def picture(whole: Frame, half: Frame, images: Mapping[str, Image]) -> Figure:
     """The images, and what share the biased image and the prior have."""
+    assert whole.reference is not None
     found = double_shrinkage.make_inputs(half, half.estimates[PHOTONS])
     share = double_shrinkage.factors(found.variance, found.mse, found.confidence)
     shown = {
@@ -300,41 +353,66 @@ def _picture(path: pathlib.Path, whole: Frame, half: Frame, images: dict) -> Non
         "double shrinkage": images["double shrinkage"],
         "james-stein, whitened": images["james-stein, whitened"],
     }
-    figure, axes = plt.subplots(2, 4, figsize=(14, 7.4), layout="compressed")
+    figure = Figure(figsize=(14, 7.4), layout="compressed")
+    axes = figure.subplots(2, 4)
     for axis, (name, image) in zip(axes.flat, shown.items(), strict=False):
         axis.imshow(np.asarray(tone_map(image)), interpolation="nearest")
         axis.set_title(name, fontsize=9)
-    shares = (("share of photons, k1", share.biased),
-              ("share of the prior, k2 (red)", share.prior))  # fmt: skip
-    for axis, (name, image) in zip(axes.flat[6:], shares, strict=True):
-        axis.imshow(np.mean(image, axis=-1), cmap="coolwarm", vmin=0, vmax=1)
+    shares = {"share of photons, k1": share.biased, "of the prior, k2": share.prior}
+    for axis, (name, image) in zip(axes.flat[6:], shares.items(), strict=True):
+        drawn = axis.imshow(np.mean(image, axis=-1), cmap="coolwarm", vmin=0, vmax=1)
         axis.set_title(name, fontsize=9)
+        figure.colorbar(drawn, ax=axis, shrink=0.7)
     for axis in axes.flat:
         axis.axis("off")
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
+    return figure
 
 
-def main() -> None:
-    """Print the tables."""
-    found = run(tyro.cli(Config, description=__doc__))
-    for scene, row in found.items():
-        print(f"\n{scene}: {row['spp']} samples a pixel or {row['passes']} passes")
-        print("\n| method | relative L2 | combining, s |\n| --- | --- | --- |")
-        for name, error in row["error"].items():
-            print(f"| {name} | {error:.5f} | {row['seconds'][name]:.3f} |")
-    for part, title in (("ablations", "ablation"), ("mse", "photons' error")):
-        print(
-            f"\n| {title} |",
-            " | ".join(found),
-            "|\n" + "| --- " * (len(found) + 1),
-            "|",
-        )
-        for name in next(iter(found.values()))[part]:
-            each = [np.atleast_1d(row[part][name]) for row in found.values()]
-            cells = (", ".join(f"{n:.5f}" for n in numbers) for numbers in each)
-            print(f"| {name} |", " | ".join(cells), "|")
+def report(found: Found) -> Report:
+    """Say what was found.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        the four tables, and a picture of each scene.
+    """
+    rows = found.scenes
+
+    def of(part: str) -> str:
+        first, *_ = (getattr(row, part) for row in rows.values())
+        cells = lambda name: [getattr(row, part)[name] for row in rows.values()]
+        return table([part, *rows], [[name, *cells(name)] for name in first])
+
+    def against(name: str) -> str:
+        ratios = (r.error["double shrinkage"] / r.error[name] for r in rows.values())
+        return ", ".join(f"{ratio:.2f}" for ratio in ratios)
+
+    answer = (
+        f"In equal time on {', '.join(rows)} double shrinkage of both has "
+        f"{against('path tracing alone')} of path tracing's relative L2, "
+        f"{against('photon mapping alone')} of photon mapping's and "
+        f"{against('path tracing alone, oidn')} of denoised path tracing's."
+    )
+    sampled = [[n, row.samples, row.passes] for n, row in rows.items()]
+    parts = [
+        [name, *(cell for row in rows.values() for cell in row.mse[name])]
+        for name in next(iter(rows.values())).mse
+    ]
+    columns = [f"{n}{part}" for n in rows for part in ("", ", dark", ", bright")]
+    tables = [
+        table(["scene", "samples a pixel", "or passes of photons"], sampled),
+        of("error"),
+        "Seconds of combining:",
+        of("seconds"),
+        of("ablations"),
+        "The photon-mapped image's mean squared error, relative:",
+        table(["told by", *columns], parts),
+        table(["time", "ratio"], found.times.items()),
+    ]
+    pictures = {scene: row.picture for scene, row in rows.items()}
+    return Report(answer, "\n\n".join(tables), pictures)
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

@@ -1,46 +1,17 @@
-"""Is double shrinkage as fast as its regression and its memory traffic allow?
+"""Double shrinkage's time beside that of its regression and its memory traffic."""
 
-    python -m experiments.double_shrinkage.double_shrinkage_speed
-
-On random images with eleven features. The prior's time is divided by that of its parts
-timed alone (`james_stein.parts`): three kinds of weights, twice the products of
-features and their matrix product, once the predictions' product. The rest is divided by
-reading the same images once and writing one, and what pools over windows also by the
-bare window sums that it cannot do without.
-"""
-
-import dataclasses
 import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import tyro
 
 from experiments.common.timing import medians
 from experiments.james_stein import parts as regression_parts
-from experiments.james_stein.parts import PARTS
 from jscomb import double_shrinkage
 from jscomb.numerics.windows import window_sum
 
 WINDOW = 15
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """What to time.
-
-    Attributes:
-        size: width and height in pixels of the rest.
-        prior_size: of the prior.
-        repeats: timed calls of each function.
-        quick: small images, one call.
-    """
-
-    size: int = 1024
-    prior_size: int = 512
-    repeats: int = 7
-    quick: bool = False
 
 
 def calls_of_prior(size: int) -> dict[str, Callable]:
@@ -51,7 +22,7 @@ def calls_of_prior(size: int) -> dict[str, Callable]:
     one = jnp.full((size, size, 1), 0.05)
     prior = jax.jit(double_shrinkage.radiance_prior, static_argnames="stride")
     parts = regression_parts.parts(size)
-    return {name: parts[name] for name in PARTS} | {
+    return {name: parts[name] for name in regression_parts.PARTS} | {
         f"prior, stride {s}": functools.partial(prior, u, b, one, one, f, stride=s)
         for s in (1, 2)
     }
@@ -85,24 +56,22 @@ def calls_of_rest(size: int) -> dict[str, Callable]:
     }
 
 
-def run(config: Config) -> dict[str, float]:
+def ratios(size: int, repeats: int) -> dict[str, float]:
     """Time everything.
 
     Args:
-        config: what.
+        size: width and height in pixels; the prior has half of it.
+        repeats: timed calls of each function.
 
     Returns:
         ratios by name.
     """
-    size, prior_size, repeats = config.size, config.prior_size, config.repeats
-    if config.quick:
-        size, prior_size, repeats = 64, 64, 1
-    t = medians(calls_of_prior(prior_size), repeats)
-    weights, products, moments, predictions = (
-        t[name] for name in regression_parts.PARTS
+    t, s = (
+        medians(calls, repeats)
+        for calls in (calls_of_prior(size // 2), calls_of_rest(size))
     )
+    weights, products, moments, predictions = (t[n] for n in regression_parts.PARTS)
     parts = 3 * weights + 2 * (products + moments) + predictions
-    s = medians(calls_of_rest(size), repeats)
     return {
         "prior / its parts": t["prior, stride 1"] / parts,
         "prior, stride 1 / stride 2": t["prior, stride 1"] / t["prior, stride 2"],
@@ -112,14 +81,3 @@ def run(config: Config) -> dict[str, float]:
         "confidence / two window sums": s["confidence"] / s["two window sums"],
         "confidence / five images": s["confidence"] / s["5 images"],
     }
-
-
-def main() -> None:
-    """Print the table."""
-    print("| what | ratio |\n| --- | --- |")
-    for name, ratio in run(tyro.cli(Config, description=__doc__)).items():
-        print(f"| {name} | {ratio:.2f} |")
-
-
-if __name__ == "__main__":
-    main()

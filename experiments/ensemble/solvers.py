@@ -1,16 +1,12 @@
 """How exact is each solver of the ensemble's weights, and what does it cost?
 
-    python -m experiments.ensemble.ensemble_solvers FOLDER
-
 Real bases of one frame of the folder (`archives`), repeated to a size, two to eight
-of them: the six denoisers, the unbiased image and a 7x7 box. Three tables:
-
-    gap      what a solver's objective exceeds the least by, relative to that of the
-             worst base, per pixel and channel: largest, mean, least. The least there
-             is comes from `hull` in float64; no solver may be below it.
-    time     seconds a megapixel of three channels, of each solver by number of bases.
-    parts    of the whole ensemble, and the weight filter beside nothing but the
-             exponentials that it takes, of random images of 1024x1024.
+of them: the six denoisers, the unbiased image and a 7x7 box. Measured are: what a
+solver's objective exceeds the least by, relative to that of the worst base, per pixel
+and channel, where the least there is comes from `hull` in float64, and no solver may be
+below it; its time by number of bases; and the time of the parts of the whole ensemble,
+with the weight filter beside nothing but the exponentials that it takes, of random
+images of twice the size.
 """
 
 import dataclasses
@@ -25,6 +21,9 @@ import tyro
 from tqdm import tqdm
 
 from experiments.common import archives
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from experiments.common.timing import medians
 from experiments.ensemble.bases import bases_of, unbiased_of
 from jscomb import ensemble
@@ -38,7 +37,7 @@ CONVERGED = 1024  # the iterative solver's default, and the paper's
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to measure.
 
     Attributes:
@@ -47,7 +46,6 @@ class Config:
         samples: samples a pixel.
         size: width and height to repeat the frame to.
         repeats: timed calls of each function.
-        quick: small images, three bases, few steps.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
@@ -55,7 +53,6 @@ class Config:
     samples: int = 64
     size: int = 512
     repeats: int = 3
-    quick: bool = False
 
 
 iterative = jax.jit(simplex.iterative, static_argnames="steps")
@@ -98,14 +95,19 @@ def objective(w, a, b, x_a, x_b) -> np.ndarray:
     return ((w * a).sum(0) - x_b) ** 2 + ((w * b).sum(0) - x_a) ** 2
 
 
+def max_objective(a, b, x_a, x_b) -> np.ndarray:
+    """That of the worst base; 1 where all are 0."""
+    a, b, x_a, x_b = (np.asarray(i, np.float64) for i in (a, b, x_a, x_b))
+    worst = ((a - x_b) ** 2 + (b - x_a) ** 2).max(0)
+    return np.where(worst > 0, worst, 1)
+
+
 def gaps(data: list[jax.Array], steps: tuple[int, ...]) -> dict[str, np.ndarray]:
     """By solver, how far each problem's objective is above the least."""
-    a, b, x_a, x_b = data
     with jax.enable_x64(True):
         double = [jnp.asarray(np.asarray(i), jnp.float64) for i in data]
         least = objective(exact(*double), *data)
-        worst = ((a - x_b) ** 2 + (b - x_a) ** 2).max(0)
-        worst = np.where(worst > 0, worst, 1)
+        worst = max_objective(*data)
         some = [i.reshape(*i.shape[:-3], -1)[..., :CHECKED] for i in double]
         found = {"reference (OSQP)": objective(general(*some), *some)}
     found["hull"] = objective(exact(*data), *data)
@@ -121,11 +123,10 @@ def gaps(data: list[jax.Array], steps: tuple[int, ...]) -> dict[str, np.ndarray]
 
 def times(data: list[jax.Array], repeats: int) -> dict[str, float]:
     """Seconds a megapixel by solver."""
-    key = jax.random.key(0)
     calls: dict[str, Callable] = {
         "hull": functools.partial(exact, *data),
         "quadratic": functools.partial(quadratic, *data),
-        "iterative": functools.partial(iterative, key, *data, steps=CONVERGED),
+        "iterative": lambda: iterative(jax.random.key(0), *data, steps=CONVERGED),
     }
     found = medians(calls, repeats)
     with jax.enable_x64(True):
@@ -141,9 +142,9 @@ def parts(data: list[jax.Array], size: int, repeats: int) -> dict[str, float]:
     """Seconds of the ensemble's parts; and of the filter with its lower bound."""
     matrix = jax.jit(ensemble.error_matrix)
     ready = matrix(*data)
-    key = jax.random.key(0)
-    z, v, albedo, normal = jax.random.uniform(key, (4, size, size, 3))
-    weights = jax.random.dirichlet(key, jnp.ones(4), (size, size, 3))
+    of_images, of_weights = jax.random.split(jax.random.key(0))
+    z, v, albedo, normal = jax.random.uniform(of_images, (4, size, size, 3))
+    weights = jax.random.dirichlet(of_weights, jnp.ones(4), (size, size, 3))
     smooth = jax.jit(
         lambda w: ensemble.filter_weights(w, z, v, albedo=albedo, normal=normal)
     )
@@ -166,45 +167,83 @@ def parts(data: list[jax.Array], size: int, repeats: int) -> dict[str, float]:
     return medians(calls, repeats)
 
 
-def run(config: Config) -> dict[str, dict]:
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """Gaps of all problems, and seconds a megapixel, by number of bases and solver."""
+
+    gaps: dict[int, dict[str, np.ndarray]]
+    times: dict[int, dict[str, float]]
+    parts: dict[str, float]
+
+
+def run(config: Config) -> Found:
     """Measure everything.
 
     Args:
-        config: what to measure.
+        config: what to measure; if quick, small images, three bases and few steps.
 
     Returns:
-        `gap`: by number of bases and solver, gaps of all problems; `time`: seconds a
-        megapixel likewise; `parts`: seconds by name.
+        gaps, and times of solvers and of parts.
     """
-    quick = config.quick
-    size, repeats = (48, 1) if quick else (config.size, config.repeats)
+    size, repeats = (48, 1) if config.quick else (config.size, config.repeats)
     a, b, x_a, x_b = problems(config, size)
-    found: dict[str, dict] = {"gap": {}, "time": {}}
-    for n in tqdm([3] if quick else range(2, 9), unit="bases"):
+    found = Found({}, {}, parts([a[:4], b[:4], x_a, x_b], 2 * size, repeats))
+    for n in tqdm([3] if config.quick else range(2, 9), unit="bases"):
         data = [a[:n], b[:n], x_a, x_b]
-        found["gap"][n] = gaps(data, STEPS[:1] if quick else STEPS)
-        found["time"][n] = times(data, repeats)
-    found["parts"] = parts([a[:4], b[:4], x_a, x_b], 2 * size, repeats)
+        found.gaps[n] = gaps(data, STEPS[:1] if config.quick else STEPS)
+        found.times[n] = times(data, repeats)
     return found
 
 
-def main() -> None:
-    """Print the tables."""
-    config = tyro.cli(Config, description=__doc__)
-    found = run(config)
-    print("| solver | bases | largest gap | mean | least |\n" + "| --- " * 5 + "|")
-    for n, gap in found["gap"].items():
-        for name, each in gap.items():
-            row = f"{each.max():.1e} | {each.mean():.1e} | {each.min():.1e}"
-            print(f"| {name} | {n} | {row} |")
-    names = list(next(iter(found["time"].values())))
-    print(f"\n| bases | {' | '.join(names)} |\n" + "| --- " * (len(names) + 1) + "|")
-    for n, spent in found["time"].items():
-        print(f"| {n} | {' | '.join(f'{spent[name]:.2f}' for name in names)} |")
-    print()
-    for name, seconds in found["parts"].items():
-        print(f"{name:<30}{1e3 * seconds:>10.1f} ms")
+def report(found: Found) -> Report:
+    """Say what was found.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        gaps, times and parts.
+    """
+    largest = {
+        name: max(gap[name].max() for gap in found.gaps.values())
+        for name in next(iter(found.gaps.values()))
+    }
+    least = {
+        name: min(gap[name].min() for gap in found.gaps.values()) for name in largest
+    }
+    shown = min(found.gaps, key=lambda n: abs(n - 4))
+    steps = [name for name in largest if name.startswith("iterative")]
+    paper = f"iterative, {CONVERGED} steps"
+    paper = paper if paper in largest else steps[-1]
+    spent, parts = found.times[shown], found.parts
+    answer = (
+        f"`hull` exceeds the least objective by {largest['hull']:.0e} of the worst "
+        f"base's at most; the paper's solver by {largest[paper]:.0e} ({paper}), in "
+        f"{spent['iterative'] / spent['hull']:.0f} times the time of {shown} bases "
+        f"({CONVERGED} steps); OSQP takes {spent['reference'] / spent['hull']:.0f} "
+        "times the time. The weight filter takes "
+        f"{parts['filter_weights'] / parts['its exponentials']:.0f} times its "
+        "exponentials alone."
+    )
+    cells = lambda name: [f"{g[name].max():.1e} ({g[name].mean():.1e})"
+                          for g in found.gaps.values()]  # fmt: skip
+    bases = [f"{n} bases" for n in found.gaps]
+    solvers = list(spent)
+    tables = [
+        table(
+            ["largest gap (mean)", *bases, "least of all"],
+            [[name, *cells(name), f"{least[name]:.1e}"] for name in largest],
+        ),
+        f"Seconds a megapixel of three channels: `iterative` with {CONVERGED} steps, "
+        f"the reference from {CHECKED} problems, three a pixel.",
+        table(
+            ["bases", *solvers],
+            [[n, *(each[s] for s in solvers)] for n, each in found.times.items()],
+        ),
+        table(["part, four bases", "ms"], [[n, 1e3 * s] for n, s in parts.items()]),
+    ]
+    return Report(answer, "\n\n".join(tables))
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

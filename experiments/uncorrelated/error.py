@@ -1,11 +1,8 @@
 """What are uncorrelated kernels worth on rendered scenes, and what do they cost?
 
-    python -m experiments.uncorrelated.uncorrelated SCENES REFERENCES OUT
-
-Every SCENES/NAME/scene.xml with a REFERENCES/NAME.npz (see `frames`) is rendered into
-OUT: four sub-averages of independent and four of common random numbers, and four more
-independent ones for the methods that have no use for common numbers, so that all spend
-the same. Two tables:
+Every SCENES/NAME/scene.xml with a REFERENCES/NAME.npz (`archives`) is rendered: four
+sub-averages of independent and four of common random numbers, and four more independent
+ones for the methods that have no use for common numbers, so that all spend the same.
 
     error    relative L2, less the reference's noise, of each method divided by that of
              path tracing with all samples independent; and of every gamma chosen.
@@ -16,7 +13,6 @@ the same. Two tables:
 
 import dataclasses
 import functools
-import json
 import pathlib
 from collections.abc import Callable
 
@@ -26,11 +22,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from experiments.common.command import Options, main
+from experiments.common.errors import geometric_mean, relative_l2
+from experiments.common.report import Report
+from experiments.common.results import Results
+from experiments.common.tables import table
 from experiments.common.timing import medians
-from jscomb import exr, uncorrelated
-from jscomb.cli import render_file
+from jscomb import rendering, uncorrelated
+from jscomb.denoisers import oidn
 from jscomb.frame import Frame, Reference
-from jscomb.metrics import rel_l2
 from jscomb.numerics.poisson import reconstruct
 from jscomb.rendering import Settings
 from jscomb.typing import Image
@@ -41,47 +41,43 @@ _EXPONENTIALS = 256, 64 * 64 * 3  # turns, and numbers in cache
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to render and to measure.
 
     Attributes:
         scenes: folder of folders with a Mitsuba scene.xml each.
         references: folder of archives with references of the same names.
-        out: folder for the frames and the results.
+        work: folder that keeps what is rendered, and the results.
         repeats: timed calls of each function.
         size: side of the image that is timed.
         windows: widths in pixels.
-        quick: only the first scene, with few samples, and the first window.
     """
 
     scenes: tyro.conf.Positional[pathlib.Path]
     references: tyro.conf.Positional[pathlib.Path]
-    out: tyro.conf.Positional[pathlib.Path]
+    work: tyro.conf.Positional[pathlib.Path]
     repeats: int = 5
     size: int = 512
     windows: tuple[int, ...] = (7, 11, 15, 21)
-    quick: bool = False
 
 
 def frame_pair(
-    scene: str, samples: int, size: tuple[int, int], out: pathlib.Path
+    scene: pathlib.Path, samples: int, reference: Reference, work: pathlib.Path
 ) -> tuple[Frame, Frame]:
-    """Frames of independent and common random numbers, rendered if they are not there.
+    """Frames of independent and common random numbers, or what a run has left of them.
 
     Args:
-        scene: name of an own scene, or an XML file.
+        scene: the XML file.
         samples: samples a pixel of common numbers; there are twice as many independent.
-        size: height and width in pixels.
-        out: folder for them.
+        reference: of the scene; says the size.
+        work: folder for them.
 
     Returns:
-        eight sub-buffers and four, of equally many samples.
+        eight sub-buffers with the reference, and four, of equally many samples.
     """
-    name = pathlib.Path(scene).parent.name if scene.endswith(".xml") else scene
-    height, width = size
+    height, width, _ = reference.image.shape
     each = []
     for kind, buffers, seed in (("independent", 8, 0), ("common", 4, COMMON_SEED)):
-        path = out / f"{name}-{samples}-{kind}.exr"
         settings = Settings(
             spp=samples * buffers // 4,
             width=width,
@@ -90,10 +86,9 @@ def frame_pair(
             numbers=kind,
             seed=seed,
         )
-        if not path.exists():
-            render_file(scene, path, settings, denoise=kind == "independent")
-        each.append(exr.read_frame(path))
-    return each[0], each[1]
+        partial = work / f"{scene.parent.name}-{samples}-{kind}.npz"
+        each.append(rendering.render(f"{scene}", settings, partial=partial))
+    return each[0]._replace(reference=reference), each[1]
 
 
 def first_half(frame: Frame) -> Frame:
@@ -107,21 +102,16 @@ def with_gradients(independent: Image, correlated: Image) -> Image:
     return reconstruct(independent, *differences)
 
 
-def measure(
-    independent: Frame,
-    correlated: Frame,
-    reference: Reference,
-    windows: tuple[int, ...],
-) -> dict:
+def measure(independent: Frame, correlated: Frame, windows: tuple[int, ...]) -> dict:
     """Errors of all methods, and every gamma."""
     every = independent.normalised()
     z_frame = correlated.normalised(every.unit)
-    r, noise = (i / every.unit for i in reference)
     y_frame = first_half(every)
+    assert y_frame.samples is not None
     y, z, n = y_frame.buffers.color, z_frame.buffers.color, y_frame.samples / 4
     images = {
         "path tracing": every.color,
-        "oidn": every.estimates["oidn"].image,
+        "oidn": oidn.denoise_frame(every).image,
         "common numbers": z_frame.color,
         "both": (y_frame.color + z_frame.color) / 2,
         "uniform": uncorrelated.combine_uniform(y, z),
@@ -144,7 +134,7 @@ def measure(
     images["L2, uncorrelated"] = jax.jit(uncorrelated.combine_decorrelated)(
         y, z_l2, gammas["L2, uncorrelated"], n
     )
-    error = lambda image: float(rel_l2(image, r, half_difference=noise))
+    error = functools.partial(relative_l2, frame=every)
     halves = [jnp.mean(i.reshape(2, 2, *i.shape[1:]), axis=1) for i in (y, z)]
     combine = jax.jit(uncorrelated.combine)
     by_gamma = {
@@ -214,52 +204,73 @@ def run(config: Config) -> dict:
         raise ValueError(
             f"no scene in {config.scenes} has an archive in {config.references}"
         )
-    config.out.mkdir(parents=True, exist_ok=True)
-    kept = config.out / "results.json"
-    found = json.loads(kept.read_text()) if kept.exists() else {}
+    kept, found = Results(config.work / "results.jsonl"), {}
     todo = [(path, samples) for samples in SAMPLES for path in paths]
     windows = config.windows
     if config.quick:
         todo, windows = [(paths[0], 8)], windows[:1]
-    for path, samples in tqdm(todo, unit="frame"):
-        name = f"{path.parent.name} {samples}"
-        if name in found:
-            continue
+    config.work.mkdir(parents=True, exist_ok=True)
+
+    def measured(path: pathlib.Path, samples: int) -> dict:
         with np.load(config.references / f"{path.parent.name}.npz") as data:
             both = data["reference"], data["reference_half_difference"]
         reference = Reference(*map(jnp.asarray, both))
-        size = reference.image.shape[:2]
-        frames = frame_pair(str(path), samples, size, config.out)
-        found[name] = measure(*frames, reference, windows)
-        kept.write_text(json.dumps(found, indent=1))
+        return measure(*frame_pair(path, samples, reference, config.work), windows)
+
+    for path, samples in tqdm(todo, unit="frame"):
+        name = f"{path.parent.name} {samples}"
+        make = functools.partial(measured, path, samples)
+        found[name] = kept.get(f"{name} {windows}", make)
     size, repeats = (64, 1) if config.quick else (config.size, config.repeats)
     return {"frames": found, "speed": speed(size, windows, repeats)}
 
 
-def main() -> None:
-    """Print the tables."""
-    found = run(tyro.cli(Config, description=__doc__))
-    rows = found["frames"]
-    methods = next(iter(rows.values()))["error"]
-    print("| error / path tracing |", " | ".join(rows), "| mean |")
-    print("| --- " * (len(rows) + 2) + "|")
-    for method in methods:
-        each = [r["error"][method] / r["error"]["path tracing"] for r in rows.values()]
-        cells = " | ".join(f"{ratio:.3f}" for ratio in each)
-        print(f"| {method} | {cells} | {np.exp(np.mean(np.log(each))):.3f} |")
-    for kind in ("gamma", "error by gamma"):
-        print(f"\n| {kind} |", " | ".join(rows), "|")
-        print("| --- " * (len(rows) + 1) + "|")
-        for name in next(iter(rows.values()))[kind]:
-            cells = " | ".join(f"{r[kind][name]:.4g}" for r in rows.values())
-            print(f"| {name} | {cells} |")
-    columns = list(next(iter(found["speed"].values())))
-    print(
-        "\n| window |", " | ".join(columns), "|\n" + "| --- " * (len(columns) + 1) + "|"
+def report(found: dict) -> Report:
+    """Say what was found.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        errors, gammas and times.
+    """
+    rows, times = found["frames"], found["speed"]
+    ratios = {
+        method: [r["error"][method] / r["error"]["path tracing"] for r in rows.values()]
+        for method in next(iter(rows.values()))["error"]
+    }
+    windows = [f"uncorrelated {window}" for window in times]
+    span = lambda each: (
+        f"{geometric_mean(each):.2f} ({min(each):.2f} to {max(each):.2f})"
     )
-    for name, row in found["speed"].items():
-        print(f"| {name} |", " | ".join(f"{row[c]:.3g}" for c in columns), "|")
+    said = ", ".join(
+        f"{span(ratios[w])} with windows of {window}"
+        for w, window in zip(windows, times, strict=True)
+    )
+    default = times.get("15x15", next(iter(times.values())))
+    combine, select = (default[f"{n} / exponentials"] for n in ("combine", "select"))
+    answer = (
+        f"At equal samples uncorrelated kernels have, of path tracing's relative L2 "
+        f"(geometric mean of {len(rows)} frames), {said}; Open Image Denoise has "
+        f"{geometric_mean(ratios['oidn']):.2f}. Combining takes {combine:.2f} times as "
+        f"long as its exponentials alone, choosing gamma {select / combine:.1f} times "
+        "as long as combining."
+    )
+    tables = [
+        table(
+            ["error / path tracing", *rows, "mean"],
+            [[m, *each, geometric_mean(each)] for m, each in ratios.items()],
+        )
+    ]
+    for kind in ("gamma", "error by gamma"):
+        names = next(iter(rows.values()))[kind]
+        cells = [[name, *(r[kind][name] for r in rows.values())] for name in names]
+        tables.append(table([kind, *rows], cells))
+    columns = list(next(iter(times.values())))
+    cells = [[w, *(row[c] for c in columns)] for w, row in times.items()]
+    tables.append(table(["window", *columns], cells))
+    return Report(answer, "\n\n".join(tables))
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)
