@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jscomb
-from experiments.training import ship, train
 from jscomb import exr
 from jscomb.denoisers import kernel_predicting, oidn
 from jscomb.learning import checkpoints, losses, networks, recipes, training
@@ -249,69 +247,3 @@ def test_shipped_files_are_small_and_described():
         assert card["steps"] == card["schedule"]["steps"]
         assert card["losses"]["validation"][-1] < card["losses"]["validation"][0]
         assert card["error"]
-
-
-@pytest.fixture(scope="module")
-def crops(tmp_path_factory):
-    """Return a folder of four pieces of each bundled frame; the first is held out."""
-    folder = tmp_path_factory.mktemp("crops")
-    for file in (pathlib.Path(jscomb.__file__).parent / "data").glob("*.exr"):
-        frame, spp = exr.read_frame(file), file.stem.rpartition("-")[2]
-        for k, (row, column) in enumerate(np.ndindex(2, 2)):
-            rows, columns = (slice(64 * n, 64 * n + 64) for n in (row, column))
-            cut = lambda a: a[..., rows, columns, :] if a.ndim > 2 else a  # noqa: B023
-            exr.write_frame(folder / f"piece-{k}-{spp}.exr", jax.tree.map(cut, frame))
-    return folder
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["pd", "kernels-njs"])
-def test_quick_training_lowers_the_validation_loss(method, crops, tmp_path):
-    """On a held-out piece; and a finished run stays unchanged.
-
-    For the two that start far from their optimum: njs and dsc start as the estimators
-    without a network, which a minute of training does not certainly improve.
-    """
-    if method == "pd" and not oidn.available():
-        pytest.skip("needs Open Image Denoise")
-    config = train.Config(method, crops, tmp_path / "run", quick=True)
-    card = train.run(config)
-    first, *_, last = card["losses"]["validation"]
-    assert last < first
-    assert card["frames"] == [6, 2]
-    assert (tmp_path / "run" / "losses.png").stat().st_size > 1000
-    before = (tmp_path / "run" / "network.safetensors").read_bytes()
-    with pytest.raises(ValueError, match="holds another run"):
-        train.run(dataclasses.replace(config, size="full"))
-    assert (tmp_path / "run" / "network.safetensors").read_bytes() == before
-
-
-def test_split_is_by_scene(tmp_path):
-    names = [f"random-{k:05d}-{spp}.exr" for k in range(20) for spp in (4, 64)]
-    for name in names:
-        (tmp_path / name).touch()
-    learned, held = train.split(tmp_path)
-    assert len(learned) == 36
-    assert len(held) == 4
-    scenes = lambda files: {train.scene_of(f) for f in files}
-    assert not scenes(learned) & scenes(held)
-    with pytest.raises(ValueError, match="wanted two"):
-        train.split(tmp_path / "empty")
-
-
-def test_frames_without_a_reference_are_refused(tmp_path, glass_frame):
-    bare = glass_frame._replace(reference=None)
-    exr.write_frame(tmp_path / "bare-4.exr", bare)
-    with pytest.raises(ValueError, match=r"bare-4\.exr has no reference"):
-        train.prepare("dsc", [tmp_path / "bare-4.exr"])
-
-
-def test_only_a_run_of_the_method_is_shipped(tmp_path):
-    card = {"method": "pd-smape", "size": "light", "steps": 3, "schedule": {}}
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "network.json").write_text(json.dumps(card))
-    config = ship.Config("pd", run, tmp_path, out=tmp_path / "weights")
-    with pytest.raises(ValueError, match="is a run of pd-smape"):
-        ship.run(config)
-    assert not config.out.exists()

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.comparison.combiners import combiners
 from jscomb import combine, exr, james_stein, methods, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Needs, make_frame
@@ -99,7 +98,6 @@ def test_ten_lines_are_a_method_everywhere(monkeypatch, jscomb, tmp_path, glass_
     np.testing.assert_allclose(exr.read_image(out), expected, rtol=1e-5)
     assert "average (half of each)" in " ".join(jscomb("combine", "--help")[1].split())
     assert "methods.plan average" in catalogue.combiners()
-    assert combiners()["average"].traced
     assert "| `average` | half of each | one estimate |  |" in methods.table()
     made = combine(key(), glass_frame, method="average")
     assert made.halves.shape == (2, 64, 64, 3)

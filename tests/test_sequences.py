@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.benchmarks import large
 from jscomb import exr, methods
 from jscomb.cli import _combining
 from jscomb.numerics import tiles
@@ -104,15 +103,3 @@ def test_names_must_differ(jscomb, tmp_path):
     status, _, said = jscomb("combine", GLASS, other, "-o", tmp_path / "out")
     assert status == 2
     assert f"several frames would be written as {GLASS.name}" in said
-
-
-def test_large_frames_of_any_size(glass_frame):
-    config = large.Config(GLASS, methods=("whitened",), budget=2, quick=True)
-    (row,) = large.run(config).values()
-    assert row.tile < 256
-    assert row.difference < 1e-6
-    assert row.seconds > 0
-    grown = large.enlarged(glass_frame, 100)
-    assert grown.color.shape == (100, 100, 3)
-    np.testing.assert_array_equal(grown.color[:64, :64], glass_frame.color)
-    np.testing.assert_array_equal(grown.color[64:], grown.color[28:64][::-1])

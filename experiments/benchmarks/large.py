@@ -1,7 +1,5 @@
 """What does a large frame cost, as a whole and by crops?
 
-    python -m experiments.benchmarks.large FRAME.exr --sizes 1024 2048 4096
-
 The frame is mirrored until it is as large as asked. Every method combines it by crops
 that keep to a memory budget and, up to a size, as a whole: seconds of the second run,
 the most memory that the process ever held (the frame included), and the largest
@@ -11,7 +9,6 @@ difference between the two, relative to the brightest pixel.
 import dataclasses
 import pathlib
 import resource
-import sys
 import time
 from typing import NamedTuple
 
@@ -20,6 +17,9 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from experiments.common.timing import apart
 from jscomb import exr, methods
 from jscomb.frame import Frame
@@ -28,7 +28,7 @@ from tests.battery.rendering import mirrored
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to measure.
 
     Attributes:
@@ -37,7 +37,6 @@ class Config:
         methods: of `jscomb.methods`.
         budget: mebibytes of a crop's program.
         whole: largest size that is also combined as a whole.
-        quick: one small size.
     """
 
     frame: tyro.conf.Positional[pathlib.Path]
@@ -45,7 +44,6 @@ class Config:
     methods: tuple[str, ...] = ("whitened", "njs")
     budget: int = 512
     whole: int = 2048
-    quick: bool = False
 
 
 class Row(NamedTuple):
@@ -140,20 +138,31 @@ def run(config: Config) -> dict[tuple[str, int], Row]:
     return rows
 
 
-def main() -> None:
-    """Print the table."""
-    config = tyro.cli(Config, description=__doc__)
-    try:
-        rows = run(config)
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        sys.exit(f"large: {' '.join(str(error).split())}")
-    print("| method, size | tile | s | MiB | whole: s | MiB | difference |")
-    for (method, size), row in rows.items():
-        cells = [f"{row.tile}", f"{row.seconds:.2f}", f"{row.memory:.0f}"]
-        rest = row.whole, row.whole_memory, row.difference
-        cells += ["" if value is None else f"{value:.3g}" for value in rest]
-        print(f"| {method} {size} | {' | '.join(cells)} |")
+def report(rows: dict[tuple[str, int], Row]) -> Report:
+    """Say what was found.
+
+    Args:
+        rows: by `run`.
+
+    Returns:
+        a line for each method and size.
+    """
+    largest = max(size for _, size in rows)
+    each = [
+        f"{method} {row.seconds:.1f} s and {row.memory / 1024:.1f} GiB"
+        for (method, size), row in rows.items()
+        if size == largest
+    ]
+    apart = [row.difference for row in rows.values() if row.difference is not None]
+    answer = (
+        f"By crops {largest}x{largest} pixels take {', '.join(each)}, the frame "
+        f"included; where both were done, crops and the whole differ by "
+        f"{max(apart):.1g} of the brightest pixel at most."
+    )
+    header = "method", "size", "tile", "s", "MiB", "whole: s", "MiB", "difference"
+    cells = [[method, size, *row] for (method, size), row in rows.items()]
+    return Report(answer, table(header, cells))
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

@@ -1,7 +1,5 @@
 """What does each public function cost, and how does that grow with the image?
 
-    python -m experiments.benchmarks.performance --results RESULTS.jsonl
-
 On the bundled frame, mirrored until it is as large as asked: seconds, the time that the
 function's arithmetic takes at the rates of the same run (matrix products, other
 arithmetic, exponentials; or a copy of its arguments and results if that is longer), the
@@ -11,7 +9,7 @@ measured is kept, and a second run goes on from there.
 """
 
 import dataclasses
-import json
+import functools
 import math
 import pathlib
 import time
@@ -19,10 +17,13 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import tyro
 from tqdm import tqdm
 
 from experiments.benchmarks.work import Work, rates, work_of
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.results import Results
+from experiments.common.tables import table
 from experiments.common.timing import medians
 from jscomb import exr
 from tests.battery import catalogue, parts
@@ -32,20 +33,18 @@ LONG = 1.5  # seconds after which a warm-up makes no difference
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to measure.
 
     Attributes:
-        results: JSON lines, one a function and size; None to keep nothing.
+        results: file that costs are kept in; None to keep none.
         sizes: widths and heights in pixels, two.
         only: functions whose names begin so.
-        quick: two small sizes, few functions.
     """
 
     results: pathlib.Path | None = None
     sizes: tuple[int, int] = (1024, 2048)
     only: str = ""
-    quick: bool = False
 
 
 class Cost(NamedTuple):
@@ -79,13 +78,15 @@ def functions(*, quick: bool = False) -> dict[str, Callable[[Rendering], Any]]:
     return {name: found[name] for name in few} if quick else found
 
 
-def measure(function: Callable[[Rendering], Any], r: Rendering, best: Work) -> Cost:
+def measure(
+    function: Callable[[Rendering], Any], r: Rendering, best: Callable[[], Work]
+) -> Cost:
     """One function at one size.
 
     Args:
         function: to compile and call.
         r: what it is given.
-        best: the machine's rates.
+        best: the machine's rates, measured when they are first needed.
 
     Returns:
         its cost; the median of some calls after the first, or that if it is long.
@@ -100,7 +101,7 @@ def measure(function: Callable[[Rendering], Any], r: Rendering, best: Work) -> C
         repeats = min(7, math.ceil(LONG / 2 / seconds))
         seconds = medians({"": lambda: program(r)}, repeats)[""]
     memory = program.memory_analysis().temp_size_in_bytes
-    ceiling = work_of(function, r).seconds(best)
+    ceiling = work_of(function, r).seconds(best())
     return Cost(seconds, ceiling, memory, compiling)
 
 
@@ -115,34 +116,22 @@ def run(config: Config) -> dict[str, dict[int, Cost]]:
     """
     sizes = (32, 64) if config.quick else config.sizes
     found = functions(quick=config.quick)
-    known: dict[str, dict[int, Cost]] = {}
-    if config.results is not None and config.results.exists():
-        for line in config.results.read_text().splitlines():
-            name, size, *cost = json.loads(line)
-            known.setdefault(name, {})[size] = Cost(*cost)
+    kept, costs = Results(config.results), {}
     wanted = [name for name in found if name.startswith(config.only)]
-    missing = [(n, s) for s in sizes for n in wanted if s not in known.get(n, {})]
-    if missing:
-        frame = exr.read_frame(exr.bundled()["cornell-glass-64"])
-        small = rendering_of(frame)
-        if config.quick:
-            small = Rendering(*(i[:32, :32] for i in small[:-1]), small.unit)
-        best = rates(repeats=3)
+    best = functools.cache(lambda: rates(repeats=3))
+    small = rendering_of(exr.read_frame(exr.bundled()["cornell-glass-64"]))
+    if config.quick:
+        small = Rendering(*(i[:32, :32] for i in small[:-1]), small.unit)
     for size in sizes:
-        here = [name for name, at in missing if at == size]
-        if not here:
-            continue
         r = mirrored(small, size)
-        for name in tqdm(here, unit="function", desc=f"{size}x{size}"):
-            cost = measure(found[name], r, best)
-            known.setdefault(name, {})[size] = cost
-            if config.results is not None:
-                with config.results.open("a") as lines:
-                    print(json.dumps([name, size, *cost]), file=lines)
-    return {name: {size: known[name][size] for size in sizes} for name in wanted}
+        for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
+            make = functools.partial(measure, found[name], r, best)
+            cost = kept.get(f"{name}, {size}", make)
+            costs.setdefault(name, {})[size] = Cost(*cost)
+    return costs
 
 
-def row(name: str, costs: dict[int, Cost]) -> str:
+def row(name: str, costs: dict[int, Cost]) -> list[object]:
     """One line of the table.
 
     Args:
@@ -150,31 +139,46 @@ def row(name: str, costs: dict[int, Cost]) -> str:
         costs: at two sizes, the smaller first.
 
     Returns:
-        a line of Markdown, per pixel of the larger size.
+        its cells, per pixel of the larger size.
     """
     (small, first), (large, last) = costs.items()
     pixels = large**2
-    growth = math.log(last.seconds / first.seconds) / math.log(pixels / small**2)
-    cells = [
-        f"{1e6 * last.seconds / pixels:.3g}",
-        f"{1e6 * last.ceiling / pixels:.2g}",
-        f"{last.seconds / last.ceiling:.2g}",
-        f"{first.memory / small**2:.0f}, {last.memory / pixels:.0f}",
-        f"{growth:.2f}",
-        f"{first.compiling:.1f}",
+    return [
+        f"`{name}`",
+        1e6 * last.seconds / pixels,
+        1e6 * last.ceiling / pixels,
+        last.seconds / last.ceiling,
+        first.memory / small**2,
+        last.memory / pixels,
+        math.log(last.seconds / first.seconds) / math.log(pixels / small**2),
+        first.compiling,
     ]
-    return f"| `{name}` | {' | '.join(cells)} |"
 
 
-def main() -> None:
-    """Print the table."""
-    config = tyro.cli(Config, description=__doc__)
-    table = run(config)
-    print("| function | s/Mpx | ceiling | ratio | B/pixel | growth | compiling: s |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for name, costs in table.items():
-        print(row(name, costs))
+def report(costs: dict[str, dict[int, Cost]]) -> Report:
+    """Say what was found.
+
+    Args:
+        costs: by `run`.
+
+    Returns:
+        a line a function.
+    """
+    rows = [row(name, cost) for name, cost in costs.items()]
+    ratios = sorted(float(str(each[3])) for each in rows)
+    growth = [float(str(each[6])) for each in rows]
+    slowest = max(rows, key=lambda each: each[3])
+    answer = (
+        f"Half of {len(rows)} functions take at most {ratios[len(rows) // 2]:.1f} "
+        f"times as long as their arithmetic or a copy of their images, all at most "
+        f"{ratios[-1]:.0f} times ({slowest[0]}); time grows as the pixels to a power "
+        f"of {min(growth):.2f} to {max(growth):.2f}."
+    )
+    sizes = list(next(iter(costs.values())))
+    memory = [f"B/pixel at {size}" for size in sizes]
+    header = "function", "s/Mpx", "ceiling", "ratio", *memory, "growth", "compiling, s"
+    return Report(answer, table(header, rows))
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

@@ -124,7 +124,7 @@ def combiners() -> dict[str, Combiner]:
     """All methods and their variants by name.
 
     Uncorrelated kernels are not here: they combine two renderings, not a rendering and
-    its denoised image (`experiments.uncorrelated.uncorrelated`).
+    its denoised image (`experiments.uncorrelated.error`).
     """
     return {
         "path tracing": Combiner(lambda frame, scale: frame.color, 0, traced=True),

@@ -1,12 +1,9 @@
 """Do trained networks beat the estimators without, on scenes unseen in training?
 
-    python -m experiments.training.learned FOLDER --runs RUNS --results FILE.json
-
-Every archive in the folder (`archives`), at every sample count: relative L2,
-corrected for the reference's noise, of both inputs, of the estimators without a
-network, and of the networks: those that come with the package, or each run of
-`training.train` in RUNS by the name of its folder. Then the geometric mean over the
-frames of the ratio to the better of the two inputs, and the worst frame.
+Every archive in the folder (`archives`), at every sample count: relative L2, less the
+reference's noise, of both inputs, of the estimators without a network, and of the
+networks: those that come with the package, or each run of `training.train` in RUNS by
+the name of its folder. Untrained is the same network as training starts from.
 """
 
 import dataclasses
@@ -14,53 +11,48 @@ import functools
 import json
 import pathlib
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
-import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
-from experiments.common import archives
+from experiments.common import archives, errors
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from experiments.training import train
 from jscomb import double_shrinkage, james_stein, progressive
 from jscomb.frame import Frame
 from jscomb.learning import networks, recipes
 from jscomb.learning.recipes import RECIPES
-from jscomb.metrics import rel_l2
 from jscomb.typing import Image
 
 INPUTS = ("path tracing", "oidn")
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to measure.
 
     Attributes:
         folder: of NumPy archives.
         runs: folder of runs; None for the shipped networks.
         results: file that stores results as they come.
-        curves: picture of all runs' losses to write.
-        quick: only the first archive, at its minimum sample count.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
     runs: pathlib.Path | None = None
     results: pathlib.Path | None = None
-    curves: pathlib.Path | None = None
-    quick: bool = False
 
 
 def _errors(images: dict[str, Image], frame: Frame) -> dict[str, float]:
     """Return the relative L2 of each."""
-    assert frame.reference is not None
-    r, noise = frame.reference
-    error = lambda image: float(rel_l2(image, r, half_difference=noise))
-    return {name: error(image) for name, image in images.items()}
+    return {name: errors.relative_l2(image, frame) for name, image in images.items()}
 
 
-def measure_untrained(frame: Frame) -> dict[str, float]:
+def measure_inputs(frame: Frame) -> dict[str, float]:
     """Return errors of the inputs, and of combinations without a network.
 
     Args:
@@ -100,23 +92,30 @@ def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
     return sorted(both, key=plain)
 
 
-def measure_network(
-    frame: Frame, method: str, network: recipes.Network
-) -> dict[str, float]:
+class Trained(NamedTuple):
+    """A network, and what its training began with."""
+
+    method: str
+    network: recipes.Network
+    untrained: recipes.Network
+
+
+def measure_network(frame: Frame, of: Trained) -> dict[str, float]:
     """Return errors of a network's combination, and of variants of it.
 
     Args:
         frame: with the estimate "oidn", its halves and a reference.
-        method: a key of `train.ALL`.
-        network: of that method.
+        of: the network; its method is a key of `train.ALL`.
 
     Returns:
         relative L2 by the variant's name, after a comma; "" for none.
     """
+    method, network, _ = of
     frame, recipe = frame.normalised(), train.ALL[method]
-    combine = jax.jit(functools.partial(recipe.combine, network))
+    combine_with = jax.jit(recipe.combine)
+    combine = functools.partial(combine_with, network)
     inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
-    images = {"": combine(inputs)}
+    images = {"": combine(inputs), ", untrained": combine_with(of.untrained, inputs)}
     if method.startswith("njs"):
         regressed, plain = map(combine, _james_stein_inputs(frame))
         images |= {", always regressed": regressed, ", never regressed": plain}
@@ -134,10 +133,8 @@ def measure_network(
     return _errors(images, frame)
 
 
-def networks_of(
-    runs: pathlib.Path | None,
-) -> dict[str, tuple[str, recipes.Network]]:
-    """Return method and network by name.
+def networks_of(runs: pathlib.Path | None) -> dict[str, Trained]:
+    """Return the networks to measure by name.
 
     Args:
         runs: folder of runs; None for the shipped networks.
@@ -146,122 +143,144 @@ def networks_of(
         those of finished runs.
     """
     if runs is None:
-        names = [file.stem for file in recipes.WEIGHTS.glob("*.safetensors")]
-        return {
-            name: (name, recipes.shipped(name)) for name in RECIPES if name in names
-        }
+        files = [recipes.WEIGHTS / f"{name}.json" for name in RECIPES]
+        return {file.stem: _trained(file) for file in files if file.exists()}
     found = {}
     for card in sorted(runs.glob("*/network.json")):
         about = json.loads(card.read_text())
         if about["steps"] == about["schedule"]["steps"]:
-            path = card.with_name("network.safetensors")
-            network = recipes.load_network(train.ALL[about["method"]], path)
-            found[card.parent.name] = about["method"], network
+            found[card.parent.name] = _trained(card)
     return found | _separate(found)
 
 
-def _separate(
-    found: dict[str, tuple[str, recipes.Network]],
-) -> dict[str, tuple[str, recipes.Network]]:
+def _trained(card: pathlib.Path) -> Trained:
+    """Return the network of a card."""
+    about = json.loads(card.read_text())
+    recipe, seed = train.ALL[about["method"]], about["schedule"]["seed"]
+    network = recipes.load_network(recipe, card.with_suffix(".safetensors"))
+    untrained = recipe.network(jax.random.key(seed), size=about["size"])
+    return Trained(about["method"], network, untrained)
+
+
+def _separate(found: dict[str, Trained]) -> dict[str, Trained]:
     """Return a denoiser and a combiner that were trained apart, as a joint network."""
     parts = [found.get(f"{name}-light") for name in ("kernels", "njs-equal")]
     if None in parts:
         return {}
-    both = networks.Joint(jax.random.key(0), size="light")
-    both.denoiser, both.combiner = (part[1] for part in parts if part)
-    return {"kernels-light and njs-equal-light": ("kernels-njs", both)}
+    both, untrained = (
+        networks.Joint(jax.random.key(0), size="light") for _ in range(2)
+    )
+    both.denoiser, both.combiner = (part.network for part in parts if part)
+    name = "kernels-light and njs-equal-light"
+    return {name: Trained("kernels-njs", both, untrained)}
 
 
-def run(config: Config) -> dict[tuple[str, int], dict[str, float]]:
+class Found(NamedTuple):
+    """Relative L2 by name, by "frame samples"; and the losses of all runs by name."""
+
+    rows: dict[str, dict[str, float]]
+    losses: dict[str, dict[str, list]]
+
+
+def run(config: Config) -> Found:
     """Measure every frame.
 
     Args:
         config: what to measure.
 
     Returns:
-        relative L2 by name, by name of the frame and sample count.
+        errors, and losses where there are runs.
 
     Raises:
         ValueError: if the folder holds no archive.
     """
-    measures: dict[str, Callable[[Frame], dict[str, float]]] = {"": measure_untrained}
-    for name, (method, network) in networks_of(config.runs).items():
-        measures[name] = functools.partial(
-            measure_network, method=method, network=network
-        )
+    measures: dict[str, Callable[[Frame], dict[str, float]]] = {"": measure_inputs}
+    for name, network in networks_of(config.runs).items():
+        measures[name] = functools.partial(measure_network, of=network)
     found = archives.measured(
         config.folder, measures, results=config.results, quick=config.quick
     )
-    rows: dict[tuple[str, int], dict[str, float]] = {}
-    for key, errors in found.items():
+    rows: dict[str, dict[str, float]] = {}
+    for key, measured in found.items():
         frame, samples, *kind = key.split(" ")
-        row = rows.setdefault((frame, int(samples)), {})
-        row |= {" ".join(kind) + name: error for name, error in errors.items()}
-    return rows
+        row = rows.setdefault(f"{frame} {samples}", {})
+        row |= {" ".join(kind) + name: error for name, error in measured.items()}
+    cards = sorted(config.runs.glob("*/network.json")) if config.runs else []
+    losses = {c.parent.name: json.loads(c.read_text())["losses"] for c in cards}
+    return Found(rows, losses)
 
 
-def summary(
-    rows: dict[tuple[str, int], dict[str, float]],
-) -> dict[str, dict[str, float]]:
-    """Return ratios to the better input: geometric means by samples, and the worst.
+def better(row: errors.Row) -> float:
+    """Error of the better input."""
+    return min(row[name] for name in INPUTS)
+
+
+def summary(rows: dict[str, dict[str, float]], name: str) -> dict[str, float]:
+    """Ratios to the better input.
 
     Args:
-        rows: by `run`.
+        rows: errors by "frame samples".
+        name: of a method.
 
     Returns:
-        numbers by sample count and "worst", by name.
+        geometric means by samples, and the "worst" frame.
     """
-    table: dict[str, dict[str, float]] = {}
-    for name in next(iter(rows.values())):
-        ratios = {
-            key: row[name] / min(row[i] for i in INPUTS) for key, row in rows.items()
-        }
-        column = {}
-        for samples in sorted({s for _, s in rows}):
-            logs = [np.log(r) for (_, s), r in ratios.items() if s == samples]
-            column[str(samples)] = float(np.exp(np.mean(logs)))
-        table[name] = column | {"worst": max(ratios.values())}
-    return table
+    ratios = {
+        f"{samples}": [row[name] / better(row) for row in group]
+        for samples, group in errors.by_samples(rows).items()
+    }
+    means = {samples: errors.geometric_mean(each) for samples, each in ratios.items()}
+    return means | {"worst": max(map(max, ratios.values()))}
 
 
-def plot_curves(runs: pathlib.Path, out: pathlib.Path) -> None:
-    """Plot training and validation losses of all runs.
+def curves(losses: dict[str, dict[str, list]]) -> Figure:
+    """Training and validation losses of all runs."""
+    columns = min(len(losses), 4)
+    lines = -(-len(losses) // columns)
+    figure = Figure(figsize=(3.2 * columns, 2.6 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False)
+    for ax in axes.flat[len(losses) :]:
+        ax.axis("off")
+    for ax, (name, each) in zip(axes.flat, losses.items(), strict=False):
+        train.plot_losses(ax, each, title=name)
+    axes[0, 0].legend()
+    return figure
+
+
+def report(found: Found) -> Report:
+    """Say what was found.
 
     Args:
-        runs: folder of runs.
-        out: picture to write.
+        found: by `run`.
+
+    Returns:
+        means beside the worst frame, every frame, and the losses.
     """
-    cards = {f.parent.name: f for f in sorted(runs.glob("*/network.json"))}
-    columns = min(len(cards), 4)
-    lines = -(-len(cards) // columns)
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(3.2 * columns, 2.6 * lines), squeeze=False
-    )
-    for ax in axes.flat[len(cards) :]:
-        ax.axis("off")
-    for ax, (name, card) in zip(axes.flat, cards.items(), strict=False):
-        train.plot_losses(ax, json.loads(card.read_text())["losses"], title=name)
-    axes[0, 0].legend()
-    figure.tight_layout()
-    figure.savefig(out, dpi=110)
-    plt.close(figure)
-
-
-def main() -> None:
-    """Print both tables."""
-    config = tyro.cli(Config, description=__doc__)
-    if config.curves and config.runs:
-        plot_curves(config.runs, config.curves)
-    rows = run(config)
-    for name, column in summary(rows).items():
-        numbers = " | ".join(f"{value:.3f}" for value in column.values())
-        print(f"| {name} | {numbers} |")
+    rows = found.rows
     names = list(next(iter(rows.values())))
-    print("| frame | " + " | ".join(names) + " |")
-    for (frame, samples), row in rows.items():
-        print(f"| {frame} {samples} |", end="")
-        print("".join(f" {row[name]:.5f} |" for name in names))
+    trained = [name for name in names if f"{name}, untrained" in names]
+
+    def said(name: str) -> str:
+        *means, worst = summary(rows, name).values()
+        return f"{', '.join(f'{mean:.2f}' for mean in means)} (worst {worst:.2f})"
+
+    each = "; ".join(
+        f"{name} {said(name)}, untrained {said(f'{name}, untrained')}"
+        for name in trained
+    )
+    answer = (
+        f"At {', '.join(map(str, errors.by_samples(rows)))} samples, in relative L2 "
+        f"divided by the better input's (geometric means of {len(rows)} frames in "
+        f"all): {each}; the best without a network, whitened, {said('whitened')}."
+    )
+    cells = [[frame, *(row[n] for n in names)] for frame, row in rows.items()]
+    tables = [
+        errors.means(rows, names, better, title="error / better input"),
+        table(["frame", *names], cells),
+    ]
+    figures = {"Losses against steps": curves(found.losses)} if found.losses else {}
+    return Report(answer, "\n\n".join(tables), figures)
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)

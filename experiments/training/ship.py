@@ -1,7 +1,5 @@
 """Put a trained network into the package, with its card.
 
-    python -m experiments.training.ship njs RUNS/njs-light FOLDER --results FILE.json
-
 The card holds the network's training data, schedule and losses, and its errors, as
 `training.learned` measures them, on the frames of FOLDER, unseen in training.
 """
@@ -10,10 +8,10 @@ import dataclasses
 import json
 import pathlib
 import shutil
-import sys
 
 import tyro
 
+from experiments.common.command import tool
 from experiments.training import learned
 from jscomb.learning.recipes import WEIGHTS
 
@@ -53,19 +51,17 @@ def run(config: Config) -> dict:
     name = config.network.name
     if card["method"] != config.method:
         raise ValueError(f"{config.network} is a run of {card['method']}")
-    rows = learned.run(
-        learned.Config(
-            config.folder, runs=config.network.parent, results=config.results
-        )
+    measured = learned.Config(
+        config.folder, runs=config.network.parent, results=config.results
     )
-    table = learned.summary(rows)
-    if name not in table:
+    rows, _ = learned.run(measured)
+    if name not in next(iter(rows.values())):
         raise ValueError(f"{config.network} is not finished")
     card["error"] = {
         "what": "relative L2 divided by the better of path tracing and oidn: geometric"
         " mean over frames of scenes that were not trained on, by samples, and worst",
-        "oidn": table["oidn"],
-        config.method: table[name],
+        "oidn": learned.summary(rows, "oidn"),
+        config.method: learned.summary(rows, name),
     }
     config.out.mkdir(exist_ok=True)
     target = config.out / f"{config.method}.safetensors"
@@ -74,13 +70,5 @@ def run(config: Config) -> dict:
     return card
 
 
-def main() -> None:
-    """Run from the command line."""
-    try:
-        run(tyro.cli(Config, description=__doc__))
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        sys.exit(f"ship: {' '.join(str(error).split())}")
-
-
 if __name__ == "__main__":
-    main()
+    tool(Config, run)

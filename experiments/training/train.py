@@ -1,7 +1,5 @@
 """Train one of the networks on a folder of frames.
 
-    python -m experiments.training.train njs DATASET --out RUN --size light
-
 Frames of one scene in ten are held out for validation. RUN gets the network
 (`network.safetensors` with its card `network.json`), the state to resume from, the
 losses and a plot of them; the same command resumes an interrupted run. `--quick` takes
@@ -11,7 +9,6 @@ a minute.
 import dataclasses
 import json
 import pathlib
-import sys
 import time
 from collections.abc import Callable
 from typing import Literal
@@ -24,6 +21,7 @@ import tyro
 from matplotlib.axes import Axes
 from tqdm import tqdm
 
+from experiments.common.command import tool
 from experiments.training.ablations import ABLATIONS
 from jscomb import exr, metrics
 from jscomb.learning import checkpoints, recipes, training
@@ -210,7 +208,7 @@ def run(config: Config) -> dict:
     bar.close()
     card = json.loads((config.out / "network.json").read_text())
     network = checkpoints.load(config.out / "network.safetensors", network)
-    card["relative_l2"] = _relative_l2(config.method, network, held)
+    card["relative_l2"] = relative_l2(config.method, network, held)
     _write_card(config.out, card)
     print(f"{config.out}: {(time.monotonic() - since) / 60:.1f} min", end=", ")
     print(f"relative L2 of held-out frames {card['relative_l2']:.5f}")
@@ -230,10 +228,19 @@ def plot_losses(axes: Axes, losses: dict[str, list], *, title: str) -> None:
     axes.set(xlabel="step", ylabel="loss", yscale="log", title=title)
 
 
-def _relative_l2(
+def relative_l2(
     method: str, network: recipes.Network, held: training.Examples
 ) -> float:
-    """Return the geometric mean over frames, to compare networks of unlike losses."""
+    """Measure a network's error, to compare networks of unlike losses.
+
+    Args:
+        method: a key of `ALL`.
+        network: of that method.
+        held: frames.
+
+    Returns:
+        relative L2, the geometric mean over the frames.
+    """
     images = objective(method, loss=metrics.rel_l2)
     return float(jnp.exp(jnp.log(training.evaluate(images, network, held)).mean()))
 
@@ -268,13 +275,5 @@ def _write_card(out: pathlib.Path, card: dict) -> None:
     temporary.replace(out / "network.json")
 
 
-def main() -> None:
-    """Run from the command line."""
-    try:
-        run(tyro.cli(Config, description=__doc__))
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        sys.exit(f"train: {' '.join(str(error).split())}")
-
-
 if __name__ == "__main__":
-    main()
+    tool(Config, run)

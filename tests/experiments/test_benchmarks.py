@@ -1,11 +1,15 @@
 """What functions cost: their work is counted right, and what was measured is kept."""
 
+import collections
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from experiments.benchmarks import performance
+from experiments.benchmarks import large, performance, robustness
 from experiments.benchmarks.work import Work, work_of
+from jscomb import exr
 
 M, N, K = 3, 5, 7
 
@@ -68,3 +72,28 @@ def test_performance_is_measured_and_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(performance, "measure", never)
     assert performance.run(config) == found
+    assert "`smoothing.box`" in performance.report(found).body
+
+
+def test_large_frames_of_any_size(glass_frame, tmp_path):
+    path = tmp_path / "glass.exr"
+    exr.write_frame(path, glass_frame)
+    config = large.Config(path, methods=("whitened",), budget=2, quick=True)
+    rows = large.run(config)
+    (row,) = rows.values()
+    assert row.tile < 256
+    assert row.difference < 1e-6
+    assert row.seconds > 0
+    assert f"whitened {row.seconds:.1f} s" in large.report(rows).answer
+    grown = large.enlarged(glass_frame, 100)
+    assert grown.color.shape == (100, 100, 3)
+    np.testing.assert_array_equal(grown.color[:64, :64], glass_frame.color)
+    np.testing.assert_array_equal(grown.color[64:], grown.color[28:64][::-1])
+
+
+def test_robustness_counts_what_is_bad():
+    good = collections.Counter({"right image": 3, "no checksum": 2})
+    found = {"own": good, "foreign": collections.Counter({"hang": 1})}
+    said = robustness.report(found)
+    assert said.answer.startswith("1 of 6 attempts end badly; 2 times")
+    assert "| foreign |  |  |  | 1 |" in said.body

@@ -1,7 +1,5 @@
 """What does a network cost, compared with its convolutions alone?
 
-    python -m experiments.training.learned_speed
-
 On random images: seconds a megapixel of each network with its combiner, and the time
 that its convolutions would take at the rate of one large convolution of 3x3 in the same
 run (64 channels to 64), by counting their operations. Memory is what the compiled
@@ -15,8 +13,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import tyro
 
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.tables import table
 from experiments.common.timing import medians
 from jscomb.learning import networks
 from jscomb.learning.recipes import RECIPES
@@ -31,18 +31,16 @@ _INPUTS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Options):
     """What to time.
 
     Attributes:
         size: width and height in pixels.
         repeats: timed calls of each function.
-        quick: small images, one call.
     """
 
     size: int = 1024
     repeats: int = 5
-    quick: bool = False
 
 
 class Cost(NamedTuple):
@@ -143,17 +141,39 @@ def run(config: Config) -> dict[str, Cost]:
     return costs | {"ceiling": costs["ceiling"]._replace(operations=rate)}
 
 
-def main() -> None:
-    """Print the table."""
-    costs = run(tyro.cli(Config, description=__doc__))
-    ceiling = costs.pop("ceiling")
-    print(f"ceiling: {ceiling.operations / 1e9:.0f} GFLOP/s")
-    print("| network | s a megapixel | kFLOP a pixel | share at ceiling | MB / Mpx |")
-    print("| --- | --- | --- | --- | --- |")
-    for name, cost in costs.items():
-        print(f"| {name} | {cost.seconds:.2f} | {cost.operations / 1e3:.0f}", end="")
-        print(f" | {cost.share:.2f} | {cost.memory:.0f} |")
+def report(costs: dict[str, Cost]) -> Report:
+    """Say what was found.
+
+    Args:
+        costs: by `run`.
+
+    Returns:
+        the cost of every network.
+    """
+    rate = costs["ceiling"].operations
+    rows = {name: cost for name, cost in costs.items() if name != "ceiling"}
+
+    def span(kind: str) -> str:
+        some = [cost for name, cost in rows.items() if name.endswith(kind)]
+        seconds = [cost.seconds for cost in some]
+        shares = [cost.share for cost in some]
+        return (
+            f"{kind} {min(seconds):.2f} to {max(seconds):.2f} s a megapixel, "
+            f"{min(shares):.2f} to {max(shares):.2f} of it convolutions at the "
+            f"ceiling's rate, below {max(cost.memory for cost in some):.0f} MB a "
+            "megapixel"
+        )
+
+    kinds = dict.fromkeys(name.rpartition(" ")[2] for name in rows)
+    answer = f"{'; '.join(map(span, kinds))}.".capitalize()
+    header = "network", "s a megapixel", "kFLOP a pixel", "share", "MB a megapixel"
+    cells = [
+        [name, cost.seconds, cost.operations / 1e3, cost.share, cost.memory]
+        for name, cost in rows.items()
+    ]
+    ceiling = f"The ceiling: {rate / 1e9:.0f} GFLOP/s."
+    return Report(answer, f"{table(header, cells)}\n\n{ceiling}")
 
 
 if __name__ == "__main__":
-    main()
+    main(Config, run, report)
