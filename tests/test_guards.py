@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jscomb.numerics import guards
+from jscomb.numerics import guards, luminance
 
 
 @pytest.mark.parametrize("d", [1e-30, 1e-8, 1.0, 1e18])
@@ -142,3 +142,21 @@ def test_this_jax_adds_up():
     )
     found = jax.jit(lambda t, u: jnp.sum(t[:, None] * u, axis=0))(t, u)
     np.testing.assert_allclose(found, (t[:, None] * u).sum(axis=0), atol=1e-5)
+
+
+def test_a_unit_has_a_derivative_beside_bad_pixels(rng):
+    """One that depends on the image; and a square is not divided by a square."""
+    image = jnp.asarray(rng.uniform(1, 2, (4, 4, 3))).at[1, 2].set(jnp.nan)
+
+    def total(image):
+        unit = luminance.median_luminance(image)
+        return jnp.nansum(luminance.in_unit(image, unit))
+
+    value, gradient = jax.value_and_grad(total)(image)
+    unit = np.nanmedian(np.mean(image, axis=-1))
+    np.testing.assert_allclose(value, np.nansum(image) / unit, rtol=1e-12)
+    assert np.isfinite(gradient[0, 0]).all()
+    assert np.any(gradient != 1 / unit)
+    bright = jnp.full((1, 1, 1), 1e38, jnp.float32)
+    found = luminance.in_unit(bright, jnp.float32(1e20), power=2)
+    np.testing.assert_allclose(found, 0.01, rtol=1e-6)

@@ -19,6 +19,7 @@ from jscomb import double_shrinkage, james_stein, metrics, progressive
 from jscomb.denoisers import kernel_predicting, oidn
 from jscomb.frame import Estimate, Frame
 from jscomb.learning import checkpoints, losses, networks
+from jscomb.numerics import luminance
 from jscomb.typing import Image, Key, Scalar
 
 __all__ = [
@@ -112,7 +113,8 @@ def in_unit(inputs: Mapping[str, Image], unit: Scalar) -> Inputs:
         {'unbiased': 0.5, 'variance': 0.25, 'depth': 1.0}
     """
     return {
-        name: image / unit ** _POWERS.get(name, 1) for name, image in inputs.items()
+        name: luminance.in_unit(image, unit, power=_POWERS.get(name, 1))
+        for name, image in inputs.items()
     }
 
 

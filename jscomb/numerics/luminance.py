@@ -9,7 +9,7 @@ from jscomb.numerics.guards import divide
 from jscomb.numerics.medians import median
 from jscomb.typing import Image, Scalar
 
-__all__ = ["at_unit_luminance", "median_luminance"]
+__all__ = ["at_unit_luminance", "in_unit", "median_luminance"]
 
 
 def median_luminance(image: Image) -> Scalar:
@@ -57,15 +57,31 @@ def at_unit_luminance(
         0.75
     """
     unit = median_luminance(images[0])
-    # Divided twice: the unit's square may leave the range of float32.
     return unit * function(
-        *(_divided(i, unit) for i in images),
-        *(_divided(_divided(s, unit), unit) for s in squares),
+        *(in_unit(i, unit) for i in images),
+        *(in_unit(s, unit, power=2) for s in squares),
     )
 
 
-def _divided(image: Array, unit: Scalar) -> Array:
-    """Divide where an image is finite; elsewhere the unit would have no derivative."""
-    known = jnp.isfinite(image)
-    units = jnp.broadcast_to(unit, image.shape)
-    return divide(image, units, where=known, otherwise=image)
+def in_unit(
+    image: Float[Array, "*n c"], unit: Scalar, *, power: int = 1
+) -> Float[Array, "*n c"]:
+    """Return an image in another unit of radiance.
+
+    Args:
+        image: radiance to a power, shape [...,C]; may hold anything.
+        unit: radiance to measure in, positive.
+        power: 1 for radiance, 2 for its variance, 0 for features.
+
+    Returns:
+        the image divided by the unit to that power; as it is where it is not finite,
+        or the unit would have no derivative.
+
+    Example:
+        >>> print(in_unit(jnp.array([8.0, jnp.inf]), jnp.asarray(2.0), power=2))
+        [ 2. inf]
+    """
+    known, units = jnp.isfinite(image), jnp.broadcast_to(unit, image.shape)
+    for _ in range(power):  # not by the power, which may leave the range of float32
+        image = divide(image, units, where=known, otherwise=image)
+    return image

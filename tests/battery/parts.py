@@ -109,6 +109,7 @@ def parts() -> dict[str, Function]:
         "convolution.convolve": _convolved,
         "cholesky.solve": _systems,
         "luminance.median_luminance": lambda r: luminance.median_luminance(r.unbiased),
+        "luminance.in_unit": lambda r: luminance.in_unit(r.variance, r.unit, power=2),
         "sure.pooled": lambda r: risks.pooled(
             risks.Risk(r.biased, _sure(r), r.variance),
             r.unbiased,
