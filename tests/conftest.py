@@ -1,5 +1,6 @@
 """Strict arithmetic for every test: no silent broadcast, promotion or key reuse."""
 
+import gc
 import itertools
 import os
 import pathlib
@@ -27,6 +28,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_debug_key_reuse", True)
 mpl.use("agg")
+
+# Traces are many small objects: to look through them after every few hundred takes a
+# sixth of the suite.
+gc.set_threshold(200_000, 50, 100)
 
 DATA = pathlib.Path(__file__).parent / "data"
 MAPPINGS = pathlib.Path("/proc/self/maps")
@@ -93,7 +98,7 @@ def vectorised():
     """Mitsuba's LLVM variant, whatever other tests have set."""
     mi = rendering.mitsuba()
     if not os.environ.get("DRJIT_LIBLLVM_PATH"):
-        pytest.skip("needs LLVM 16 or newer")
+        pytest.skip("needs LLVM 17 or newer")
     before = mi.variant()
     mi.set_variant("llvm_ad_rgb")
     yield mi

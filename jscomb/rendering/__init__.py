@@ -13,7 +13,7 @@ other uses `plan_passes`, `Launcher`, `render_steps` and `assemble` are the step
 one. Every scene is rendered with a box filter and the path integrator.
 
 Needs the extra `render` (`pip install "jscomb[render]"`). Common random numbers and
-photon mapping need a vectorised variant of Mitsuba, that is LLVM 16 or newer.
+photon mapping need a vectorised variant of Mitsuba, that is LLVM 17 or newer.
 """
 
 from jscomb.rendering._launcher import Launcher

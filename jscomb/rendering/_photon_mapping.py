@@ -61,7 +61,7 @@ class PhotonMapper:
     def __init__(self, mi, scene, count: int) -> None:
         if mi.variant().startswith("scalar"):
             raise ValueError(
-                "photon mapping needs a vectorised variant of Mitsuba: install LLVM 16 "
+                "photon mapping needs a vectorised variant of Mitsuba: install LLVM 17 "
                 f"or newer (apt install libllvm19), got {mi.variant()}"
             )
         import drjit as dr  # comes with Mitsuba

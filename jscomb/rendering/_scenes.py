@@ -28,7 +28,7 @@ from jscomb.rendering._random_scenes import random_scene
 
 NEEDS = Needs(package=Package("mitsuba", "render"))
 MAX_DEPTH = 12
-LLVM_VERSIONS = range(25, 15, -1)  # 14 and 15 abort the process inside Dr.Jit
+LLVM_VERSIONS = range(25, 16, -1)  # 14 to 16 abort the process inside Dr.Jit
 
 
 def available() -> bool:
@@ -47,7 +47,7 @@ def mitsuba() -> Any:
     """Import Mitsuba 3 with the fastest variant that this machine can run.
 
     Returns:
-        the module, its variant set: `llvm_ad_rgb` where LLVM 16 or newer is found
+        the module, its variant set: `llvm_ad_rgb` where LLVM 17 or newer is found
         (or named by `DRJIT_LIBLLVM_PATH`), else `scalar_rgb`. A variant that the
         caller has already set is kept.
 

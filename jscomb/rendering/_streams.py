@@ -19,7 +19,7 @@ def register(mi) -> None:
     """
     if mi.variant().startswith("scalar"):
         raise ValueError(
-            "common random numbers need a vectorised variant of Mitsuba (LLVM 16 or "
+            "common random numbers need a vectorised variant of Mitsuba (LLVM 17 or "
             f"newer brings one), got {mi.variant()}"
         )
     mi.register_sampler(NAME, _sampler(mi))

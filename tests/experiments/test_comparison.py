@@ -162,6 +162,7 @@ def test_a_severely_biased_image_is_kept_out(archive):
     assert errors["path tracing"] < errors["whitened"] < errors["oidn"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [n for n in combiners() if n.startswith(("ens", "prog"))]
 )
@@ -175,6 +176,7 @@ def test_combiners_make_images(name, glass_frame):
     assert np.isfinite(image).all()
 
 
+@pytest.mark.slow
 def test_stability_of_what_has_no_network():
     found = stability.run(stability.Config(quick=True))
     assert all(outcome.finite == (True, True) for outcome in found.values())

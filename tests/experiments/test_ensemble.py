@@ -29,6 +29,7 @@ def test_ensembles_are_measured(folder, glass_frame):
     assert "| all six |" in said.body
 
 
+@pytest.mark.slow
 def test_no_solver_is_below_the_least(folder):
     """The exact one is there, more steps of the paper's bring it nearer."""
     found = solvers.run(solvers.Config(folder, "glass", 64, quick=True))

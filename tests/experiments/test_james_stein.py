@@ -1,6 +1,7 @@
 """The experiments in `james_stein` run, and say what they measured."""
 
 import numpy as np
+import pytest
 
 from experiments.common import archives
 from experiments.james_stein import (
@@ -25,6 +26,7 @@ def test_errors_are_those_of_the_metrics(folder, glass_frame):
     assert all(seconds > 0 for seconds in found.seconds.values())
 
 
+@pytest.mark.slow
 def test_regression_is_measured(folder, tmp_path):
     config = regression.Config(
         folder, tmp_path / "kept.jsonl", stride=4, window=11, quick=True

@@ -68,6 +68,7 @@ def test_bias_is_that_of_known_groups():
     assert np.all(bias.skewness(0 * samples) == 0)
 
 
+@pytest.mark.slow
 def test_bias_of_all_methods(tmp_path, vectorised):
     config = bias.Config(tmp_path, quick=True)
     found = bias.run(config)
