@@ -48,6 +48,8 @@ def pytest_collection_modifyitems(items):
         first = test.partition("[")[2].partition("-")[0].rstrip("]")
         group = f"{file} {first}" if "/battery/" in file else file
         item.add_marker(pytest.mark.xdist_group(group))
+        if file.endswith(".ipynb"):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture
