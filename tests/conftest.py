@@ -29,6 +29,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_debug_key_reuse", True)
 mpl.use("agg")
 
+pytest.register_assert_rewrite("tests.battery.promises")
+
 # Traces are many small objects: to look through them after every few hundred takes a
 # sixth of the suite.
 gc.set_threshold(200_000, 50, 100)
@@ -39,16 +41,9 @@ _TESTS = itertools.count()
 
 
 def pytest_collection_modifyitems(items):
-    """Tests that share programs run in one process, which compiles them once.
-
-    Those of a file; in the battery those of a function, by their first parameter.
-    """
+    """What runs in a process of its own is slow."""
     for item in items:
-        file, _, test = item.nodeid.partition("::")
-        first = test.partition("[")[2].partition("-")[0].rstrip("]")
-        group = f"{file} {first}" if "/battery/" in file else file
-        item.add_marker(pytest.mark.xdist_group(group))
-        if file.endswith(".ipynb"):
+        if item.path.suffix == ".ipynb":
             item.add_marker(pytest.mark.slow)
 
 

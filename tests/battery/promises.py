@@ -1,6 +1,8 @@
-"""What every public combiner, denoiser and solver promises, whatever its paper."""
+"""What every public combiner, denoiser and solver promises, whatever its paper.
 
-import inspect
+The modules beside it import these tests, each for some functions, its `ENTRIES`.
+"""
+
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,31 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import (
-    double_shrinkage,
-    ensemble,
-    james_stein,
-    methods,
-    progressive,
-    uncorrelated,
-)
-from jscomb.denoisers import (
-    bilateral,
-    kernel_predicting,
-    nfor,
-    nonlocal_means,
-    oidn,
-    rdfc,
-    smoothing,
-)
-from jscomb.numerics import poisson, regression, simplex, sure, tiles
-from tests.battery import catalogue, parts
-from tests.battery.rendering import Rendering, mirrored, rendering_of
+from jscomb.numerics import tiles
+from tests.battery.catalogue import Entry
+from tests.battery.rendering import Rendering, mirrored
 
 SIZE = 32  # pixels
-ENTRIES = (
-    catalogue.combiners() | catalogue.denoisers(window=7) | catalogue.solvers(window=7)
-)
 
 
 class Compiled(NamedTuple):
@@ -50,16 +32,15 @@ class Compiled(NamedTuple):
             none goes through it what the result changes by as all images grow.
     """
 
-    entry: catalogue.Entry
+    entry: Entry
     result: Callable[[Rendering], jax.Array]
     mapped: Callable[[Rendering], jax.Array]
     tiled: Callable[[Rendering], jax.Array]
     everything: Callable[[Rendering], tuple[jax.Array, Any]]
 
 
-def compiled(name: str) -> Compiled:
-    """The entry of that name."""
-    entry = ENTRIES[name]
+def compiled(entry: Entry) -> Compiled:
+    """All programs of an entry."""
 
     def total(r):
         result = entry.function(r)
@@ -78,25 +59,6 @@ def compiled(name: str) -> Compiled:
 
     mapped = jax.vmap(entry.function)
     return Compiled(entry, *map(jax.jit, (entry.function, mapped, tiled, everything)))
-
-
-@pytest.fixture(scope="module", params=ENTRIES)
-def function(request):
-    """One of them, for all its tests in a row; its programs are given up after them."""
-    yield compiled(request.param)
-    jax.clear_caches()
-
-
-@pytest.fixture(scope="session")
-def whole(glass_frame):
-    """A real frame with fireflies, 64x64, float32."""
-    return rendering_of(glass_frame)
-
-
-@pytest.fixture(scope="session")
-def plain(whole):
-    """A crop of it: promises do not depend on the number of pixels, the time does."""
-    return cut(whole, SIZE, SIZE)
 
 
 def cut(r, height, width):
@@ -130,17 +92,6 @@ def test_pure(function, plain):
     programs = function.result._cache_size()
     function.result(plain.scaled(jnp.float32(2)))
     assert function.result._cache_size() == programs
-
-
-@pytest.mark.parametrize("function", catalogue.combiners(), indirect=True)
-def test_eager_is_compiled(function, plain):
-    """On an image smaller than the windows.
-
-    Denoisers and solvers are loops, and those are compiled either way.
-    """
-    small = cut(plain, 4, 5)
-    eager, jitted = function.entry.function(small), function.result(small)
-    assert_close(eager, jitted, 10 * function.entry.rounding)
 
 
 def test_vmap_is_a_loop(function, plain):
@@ -279,100 +230,3 @@ def test_tiled_is_untiled(function, plain):
     # Larger than a crop, or there would be only one.
     r = mirrored(plain, max(SIZE, 24 + 2 * entry.reach + 16))
     assert_close(function.tiled(r), function.result(r), entry.rounding)
-
-
-ELSEWHERE = {
-    "of frames, and what they are made of is here": {
-        *(
-            f"{room}.{name}"
-            for room in ("bilateral", "nonlocal_means", "rdfc", "smoothing")
-            for name in ("denoise_frame", "plan_frame", "reach")
-        ),
-        "double_shrinkage.combine_frame",
-        "double_shrinkage.make_inputs",
-        "double_shrinkage.neural_combine_frame",
-        "double_shrinkage.neural_inputs",
-        "double_shrinkage.plan_neural",
-        "ensemble.combine_frame",
-        "ensemble.select_bases",
-        "ensemble.stack_estimates",
-        "james_stein.combine_frame",
-        "james_stein.neural_combine_frame",
-        "james_stein.neural_inputs",
-        "james_stein.plan_frame",
-        "james_stein.plan_neural",
-        "james_stein.reach",
-        "james_stein.regress",
-        "james_stein.worth_regressing",
-        "kernel_predicting.denoise_inputs",
-        "kernel_predicting.neural_inputs",
-        "methods.choose",
-        "methods.combine",
-        "methods.input_name",
-        "methods.inputs",
-        "methods.table",
-        "nfor.denoise_frame",
-        "oidn.denoise_color",
-        "oidn.denoise_frame",
-        "progressive.combine_frame",
-        "progressive.neural_combine_frame",
-        "progressive.neural_inputs",
-        "progressive.plan_neural",
-        "uncorrelated.combine_frame",
-        "uncorrelated.select_gamma_frame",
-    },
-    "what is here with normalisation, or without": {
-        "double_shrinkage.neural_combine",
-        "james_stein.neural_combine",
-        "kernel_predicting.denoise",
-        "oidn.denoise_normalised",
-        "progressive.neural_combine",
-    },
-    "of functions": {
-        "nonlocal_means.weights",
-        "sure.exact_sure",
-        "uncorrelated.admissibility",
-        "uncorrelated.combine_with",
-        "uncorrelated.variance_kernel",
-    },
-    "what others are held against, in float64": {
-        "simplex.reference",
-        "simplex.reference_quadratic",
-    },
-    "not of images": {"oidn.available"},
-}
-MODULES = [
-    james_stein,
-    ensemble,
-    uncorrelated,
-    double_shrinkage,
-    progressive,
-    methods,
-    bilateral,
-    kernel_predicting,
-    nfor,
-    nonlocal_means,
-    oidn,
-    rdfc,
-    smoothing,
-    poisson,
-    regression,
-    simplex,
-    sure,
-]
-
-
-def test_nothing_is_left_out():
-    """Public functions are here, or parts of those, or there is a reason why not."""
-    short = lambda module: module.__name__.rpartition(".")[2]
-    public = {
-        f"{short(module)}.{name}"
-        for module in MODULES
-        for name in module.__all__
-        if inspect.isfunction(found := getattr(module, name))
-        and found.__module__.startswith(module.__name__)
-    }
-    here = {name.partition(" ")[0] for name in ENTRIES}
-    named = here | parts.parts().keys() | set().union(*ELSEWHERE.values())
-    assert public <= named
-    assert here | set().union(*ELSEWHERE.values()) <= public

@@ -1,0 +1,120 @@
+"""Every public function keeps the promises, or there is a reason why not."""
+
+import inspect
+
+from jscomb import (
+    double_shrinkage,
+    ensemble,
+    james_stein,
+    methods,
+    progressive,
+    uncorrelated,
+)
+from jscomb.denoisers import (
+    bilateral,
+    kernel_predicting,
+    nfor,
+    nonlocal_means,
+    oidn,
+    rdfc,
+    smoothing,
+)
+from jscomb.numerics import poisson, regression, simplex, sure
+from tests.battery import catalogue, parts
+
+ENTRIES = catalogue.combiners() | catalogue.denoisers() | catalogue.solvers()
+ELSEWHERE = {
+    "of frames, and what they are made of is here": {
+        *(
+            f"{room}.{name}"
+            for room in ("bilateral", "nonlocal_means", "rdfc", "smoothing")
+            for name in ("denoise_frame", "plan_frame", "reach")
+        ),
+        "double_shrinkage.combine_frame",
+        "double_shrinkage.make_inputs",
+        "double_shrinkage.neural_combine_frame",
+        "double_shrinkage.neural_inputs",
+        "double_shrinkage.plan_neural",
+        "ensemble.combine_frame",
+        "ensemble.select_bases",
+        "ensemble.stack_estimates",
+        "james_stein.combine_frame",
+        "james_stein.neural_combine_frame",
+        "james_stein.neural_inputs",
+        "james_stein.plan_frame",
+        "james_stein.plan_neural",
+        "james_stein.reach",
+        "james_stein.regress",
+        "james_stein.worth_regressing",
+        "kernel_predicting.denoise_inputs",
+        "kernel_predicting.neural_inputs",
+        "methods.choose",
+        "methods.combine",
+        "methods.input_name",
+        "methods.inputs",
+        "methods.table",
+        "nfor.denoise_frame",
+        "oidn.denoise_color",
+        "oidn.denoise_frame",
+        "progressive.combine_frame",
+        "progressive.neural_combine_frame",
+        "progressive.neural_inputs",
+        "progressive.plan_neural",
+        "uncorrelated.combine_frame",
+        "uncorrelated.select_gamma_frame",
+    },
+    "what is here with normalisation, or without": {
+        "double_shrinkage.neural_combine",
+        "james_stein.neural_combine",
+        "kernel_predicting.denoise",
+        "oidn.denoise_normalised",
+        "progressive.neural_combine",
+    },
+    "of functions": {
+        "nonlocal_means.weights",
+        "sure.exact_sure",
+        "uncorrelated.admissibility",
+        "uncorrelated.combine_with",
+        "uncorrelated.variance_kernel",
+    },
+    "what others are held against, in float64": {
+        "simplex.reference",
+        "simplex.reference_quadratic",
+    },
+    "not of images": {"oidn.available"},
+}
+MODULES = [
+    james_stein,
+    ensemble,
+    uncorrelated,
+    double_shrinkage,
+    progressive,
+    methods,
+    bilateral,
+    kernel_predicting,
+    nfor,
+    nonlocal_means,
+    oidn,
+    rdfc,
+    smoothing,
+    poisson,
+    regression,
+    simplex,
+    sure,
+]
+
+
+def test_nothing_is_left_out():
+    """Public functions are here, or parts of those, or there is a reason why not."""
+    short = lambda module: module.__name__.rpartition(".")[2]
+    public = {
+        f"{short(module)}.{name}"
+        for module in MODULES
+        for name in module.__all__
+        if inspect.isfunction(found := getattr(module, name))
+        and found.__module__.startswith(module.__name__)
+    }
+    here = {name.partition(" ")[0] for name in ENTRIES}
+    named = here | parts.parts().keys() | set().union(*ELSEWHERE.values())
+    assert public <= named
+    assert here | set().union(*ELSEWHERE.values()) <= public
