@@ -16,12 +16,13 @@ from jscomb import cli, exr, rendering
 from jscomb.frame import CHANNELS
 
 # Tests mostly wait for programs of small images to be compiled, so LLVM compiles them
-# without optimising. JAX reads this when it first compiles; processes inherit it.
-QUICK_COMPILATION = (
+# without optimising, unless one asks for something else. JAX reads this when it first
+# compiles; processes inherit it.
+os.environ.setdefault(
+    "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    "--xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_parallel_codegen_split_count=1",
 )
-os.environ["XLA_FLAGS"] = f"{QUICK_COMPILATION} {os.environ.get('XLA_FLAGS', '')}"
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -41,9 +42,9 @@ _TESTS = itertools.count()
 
 
 def pytest_collection_modifyitems(items):
-    """What runs in a process of its own is slow."""
+    """Notebooks are slow, and so are docstrings' examples: hundreds of programs."""
     for item in items:
-        if item.path.suffix == ".ipynb":
+        if item.path.suffix == ".ipynb" or isinstance(item, pytest.DoctestItem):
             item.add_marker(pytest.mark.slow)
 
 

@@ -110,6 +110,7 @@ def test_the_pages_hold_the_table():
         assert f"| `{name}` | {method.summary} |" in methods.__doc__
 
 
+@pytest.mark.slow
 @needs_oidn
 def test_the_choice_is_the_method_it_names(small):
     found = choose(key(), small)

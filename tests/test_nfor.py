@@ -148,6 +148,7 @@ def test_nothing_is_mixed_where_nothing_is_alike():
     np.testing.assert_allclose(out, ramp, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_nfor_lowers_the_error_of_a_real_frame():
     box_frame = exr.read_frame(DATA / "cornell-box-64.exr")
     reference, noise = box_frame.reference

@@ -37,6 +37,7 @@ def small_crops(monkeypatch):
     monkeypatch.setattr(_combining, "SAMPLED", 24)
 
 
+@pytest.mark.slow
 def test_large_frames_are_the_same(jscomb, small_crops, monkeypatch, tmp_path):
     wide = tmp_path / "wide.exr"
     status, said, _ = jscomb("combine", GLASS, "-o", wide, "--method", "whitened")

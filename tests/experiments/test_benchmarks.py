@@ -56,6 +56,7 @@ def test_time_is_that_of_computing_or_moving():
     assert Work(1, 0, 0, 40).seconds(rates) == 10
 
 
+@pytest.mark.slow
 def test_performance_is_measured_and_kept(tmp_path, monkeypatch):
     config = performance.Config(tmp_path / "costs.jsonl", quick=True)
     found = performance.run(config)
@@ -75,6 +76,7 @@ def test_performance_is_measured_and_kept(tmp_path, monkeypatch):
     assert "`smoothing.box`" in performance.report(found).body
 
 
+@pytest.mark.slow
 def test_large_frames_of_any_size(glass_frame, tmp_path):
     path = tmp_path / "glass.exr"
     exr.write_frame(path, glass_frame)

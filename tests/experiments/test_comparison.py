@@ -38,6 +38,7 @@ def archive(folder, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_sweep_measures_once(archive, glass_frame):
     records = sweep.run(archive)
     found = {(r["combiner"], r["scale"]): r for r in records}
@@ -71,6 +72,7 @@ def test_sweep_measures_once(archive, glass_frame):
     assert archive.results.read_text() == before
 
 
+@pytest.mark.slow
 def test_sweep_goes_on_after_a_line_cut_short(archive):
     records = sweep.run(archive)
     archive.results.write_text(archive.results.read_text()[:-40])

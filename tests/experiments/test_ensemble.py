@@ -50,6 +50,7 @@ def test_true_matrices_are_better_than_estimates(tmp_path):
     assert "(mean of 1 scenes)" in truth.report(rows).answer
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 def test_shared_weights_are_measured_beside_own_ones(glass_frame, tmp_path):
     """An ensemble is better than its first base, which the halves underestimate."""
