@@ -14,7 +14,6 @@ import pytest
 
 from jscomb.numerics import tiles
 from jscomb.numerics.windows import window_sum
-from tests.conftest import QUICK_COMPILATION
 
 
 def blocks(image):
@@ -127,7 +126,8 @@ def test_equal_options_share_one_program():
 
 def differences(*arguments, devices):
     """Start `on_devices` in a process that has so many devices."""
-    flags = f"{QUICK_COMPILATION} --xla_force_host_platform_device_count={devices}"
+    count = f"--xla_force_host_platform_device_count={devices}"
+    flags = f"{os.environ['XLA_FLAGS']} {count}"
     return subprocess.Popen(
         [sys.executable, "-m", "tests.on_devices", *arguments],
         env=os.environ | {"XLA_FLAGS": flags},
