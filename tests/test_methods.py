@@ -17,6 +17,12 @@ key = lambda: jax.random.key(0)
 needs_oidn = pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 
 
+def slow_ones(names, slow=("ensemble", "nfor")):
+    """The names, those of methods that take long to compile marked."""
+    marks = {name: [pytest.mark.slow] for name in slow}
+    return [pytest.param(name, marks=marks.get(name, [])) for name in names]
+
+
 def error(image, frame):
     """Relative L2 of an image of a frame with a reference."""
     r, noise = frame.reference
@@ -36,7 +42,7 @@ def small(glass_frame):
 
 
 @needs_oidn
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", slow_ones(METHODS))
 def test_every_method_makes_an_estimate(name, small):
     """Finite, and each half is what the method makes of that half alone."""
     frame = small

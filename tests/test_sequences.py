@@ -17,6 +17,7 @@ GLASS, BOX = (DATA / f"cornell-{name}-64.exr" for name in ("glass", "box"))
 LOCAL = [name for name, method in methods.METHODS.items() if method.plan is not None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", LOCAL)
 def test_methods_are_local(method, glass_frame):
     """By crops, and on a device as one of several, what they are as a whole."""
