@@ -10,6 +10,7 @@ from jax.test_util import check_grads
 from jscomb import double_shrinkage, james_stein, progressive
 from jscomb.denoisers import kernel_predicting
 from jscomb.learning import networks
+from jscomb.numerics.convolution import convolve, convolve_doubled, doubled
 from jscomb.numerics.kernels import Kernels
 from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.sure import monte_carlo_sure
@@ -51,6 +52,23 @@ def test_convolution_matches_loops(size, shape, rng):
         np.testing.assert_allclose(
             run(image, True), wanted[r : shape[0] - r], atol=1e-12
         )
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (7, 4)])
+def test_convolving_a_doubled_image(shape, rng):
+    """Is convolving the repeated pixels; also its derivatives, in both modes."""
+    draw = lambda *sizes: jnp.asarray(rng.normal(size=sizes))
+    image, kernel = draw(*shape, 2), draw(3, 3, 2, 3)
+    plain = lambda image, kernel: convolve(doubled(image), kernel, rows=1)
+    repeated = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
+    np.testing.assert_array_equal(doubled(image), repeated)
+    made, pull = jax.vjp(convolve_doubled, image, kernel)
+    wanted, wanted_pull = jax.vjp(plain, image, kernel)
+    np.testing.assert_allclose(made, wanted, rtol=1e-12, atol=1e-12)
+    back = draw(*made.shape)
+    for one, other in zip(pull(back), wanted_pull(back), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)
+    check_grads(jax.jit(convolve_doubled), (image, kernel), 2)
 
 
 @pytest.mark.parametrize("size", [1, 3, 5])

@@ -131,7 +131,31 @@ def run(config: Config) -> dict[str, dict[int, Cost]]:
     return costs
 
 
-def row(name: str, costs: dict[int, Cost]) -> list[object]:
+class Row(NamedTuple):
+    """One line of the table, per pixel of the larger size.
+
+    Attributes:
+        name: of the function.
+        seconds: a megapixel.
+        ceiling: seconds of its arithmetic or of a copy, a megapixel.
+        ratio: of both.
+        memory_small: bytes a pixel at the smaller size.
+        memory_large: bytes a pixel at the larger.
+        growth: the power of the pixels that the time grows as.
+        compiling: seconds.
+    """
+
+    name: str
+    seconds: float
+    ceiling: float
+    ratio: float
+    memory_small: float
+    memory_large: float
+    growth: float
+    compiling: float
+
+
+def row(name: str, costs: dict[int, Cost]) -> Row:
     """One line of the table.
 
     Args:
@@ -139,11 +163,11 @@ def row(name: str, costs: dict[int, Cost]) -> list[object]:
         costs: at two sizes, the smaller first.
 
     Returns:
-        its cells, per pixel of the larger size.
+        its cells.
     """
     (small, first), (large, last) = costs.items()
     pixels = large**2
-    return [
+    return Row(
         f"`{name}`",
         1e6 * last.seconds / pixels,
         1e6 * last.ceiling / pixels,
@@ -152,7 +176,7 @@ def row(name: str, costs: dict[int, Cost]) -> list[object]:
         last.memory / pixels,
         math.log(last.seconds / first.seconds) / math.log(pixels / small**2),
         first.compiling,
-    ]
+    )
 
 
 def report(costs: dict[str, dict[int, Cost]]) -> Report:
@@ -165,13 +189,13 @@ def report(costs: dict[str, dict[int, Cost]]) -> Report:
         a line a function.
     """
     rows = [row(name, cost) for name, cost in costs.items()]
-    ratios = sorted(float(str(each[3])) for each in rows)
-    growth = [float(str(each[6])) for each in rows]
-    slowest = max(rows, key=lambda each: each[3])
+    ratios = sorted(each.ratio for each in rows)
+    growth = [each.growth for each in rows]
+    slowest = max(rows, key=lambda each: each.ratio)
     answer = (
         f"Half of {len(rows)} functions take at most {ratios[len(rows) // 2]:.1f} "
         f"times as long as their arithmetic or a copy of their images, all at most "
-        f"{ratios[-1]:.0f} times ({slowest[0]}); time grows as the pixels to a power "
+        f"{ratios[-1]:.0f} times ({slowest.name}); time grows as the pixels to a power "
         f"of {min(growth):.2f} to {max(growth):.2f}."
     )
     sizes = list(next(iter(costs.values())))

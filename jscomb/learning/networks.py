@@ -15,20 +15,25 @@ convolutional reconstruction for gradient-domain rendering", 2019 (signed logari
 """
 
 import itertools
-from collections.abc import Iterable
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
 from jscomb.double_shrinkage import Filters
 from jscomb.james_stein import Parameters
 from jscomb.learning.losses import compress
-from jscomb.numerics.convolution import convolve
+from jscomb.numerics.convolution import doubled
 from jscomb.numerics.kernels import Kernels
+from jscomb.numerics.layers import (
+    Convolution,
+    apply_each,
+    halved,
+    reach_of,
+    unet_reach,
+)
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Key, Variance
 
@@ -50,41 +55,6 @@ _MIXING_WIDTH = {"full": 48, "light": 24}
 _MINIMUM_WEIGHT = 1e-4  # NJS adds it to its weights
 _MAXIMUM_EXPONENT = 30.0  # of a confidence; beyond it the prior has no weight
 _VARIANCE_UNIT = 0.01  # squared normalised radiance
-
-
-class Convolution(nnx.Module):
-    """A convolution of an image with a border of zeros.
-
-    Attributes:
-        kernel: shape [k,k,in,out].
-        bias: shape [out].
-
-    Example:
-        >>> convolution = Convolution(jax.random.key(0), 3, 5)
-        >>> image = jax.eval_shape(convolution, jnp.ones((6, 4, 3)))
-        >>> print(image.shape, convolution.reach)
-        (6, 4, 5) 1
-    """
-
-    def __init__(self, key: Key, inputs: int, outputs: int, *, size: int = 3):
-        """Draw a kernel by He's rule for ReLU."""
-        deviation = np.float32((2 / (size**2 * inputs)) ** 0.5)
-        shape = check_window(size), size, inputs, outputs
-        self.kernel = nnx.Param(deviation * jax.random.normal(key, shape, jnp.float32))
-        self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))
-
-    @property
-    def reach(self) -> int:
-        """Distance of the farthest pixel that an output pixel depends on."""
-        return self.kernel.shape[0] // 2
-
-    def __call__(
-        self, image: Float[Array, "_ w i"], *, inner: bool = False
-    ) -> Float[Array, "_ w o"]:
-        """Convolve; with `inner` only the rows that have all their neighbours."""
-        kernel, bias = (p[...].astype(image.dtype) for p in (self.kernel, self.bias))
-        rows = 0 if inner else self.reach
-        return convolve(image, kernel, rows=rows) + bias.reshape(1, 1, -1)
 
 
 class UNet(nnx.Module):
@@ -124,24 +94,7 @@ class UNet(nnx.Module):
     @property
     def reach(self) -> int:
         """Distance of the farthest pixel that some pixel of a block depends on."""
-        spans = [(p, *self._span(p)) for p in range(self.multiple)]
-        return max(max(p - first, last - p) for p, first, last in spans)
-
-    def _span(self, pixel: int) -> tuple[int, int]:
-        """Return the first and last input pixel that an output pixel depends on.
-
-        Walks through the coarsest level, which sees all that the finer ones see.
-        """
-        first = last = pixel
-        for convolutions in reversed(self.up):
-            reach = _reach(convolutions)
-            first, last = (first - reach) // 2, (last + reach) // 2
-        *finer, coarsest = self.down
-        first, last = first - _reach(coarsest), last + _reach(coarsest)
-        for convolutions in reversed(finer):
-            reach = _reach(convolutions)
-            first, last = 2 * first - reach, 2 * last + 1 + reach
-        return first, last
+        return unet_reach(self.down, self.up)
 
     def __call__(self, image: Float[Array, "h w _"]) -> Float[Array, "h w _"]:
         """Return features of every pixel, at least zero, as wide as the first level.
@@ -153,13 +106,13 @@ class UNet(nnx.Module):
         image = jnp.pad(image, ((0, -height % block), (0, -width % block), (0, 0)))
         levels = []
         for convolutions in self.down:
-            image = _halved(levels[-1]) if levels else image
-            levels.append(_each(convolutions, image))
+            image = halved(levels[-1]) if levels else image
+            levels.append(apply_each(convolutions, image))
         image = levels.pop()
         for convolutions in self.up:
             finer = levels.pop()
-            both = jnp.concatenate([_doubled(image), finer], axis=-1)
-            image = _each(convolutions, both)
+            both = jnp.concatenate([doubled(image), finer], axis=-1)
+            image = apply_each(convolutions, both)
         return image[:height, :width]
 
 
@@ -300,7 +253,7 @@ class MixingNetwork(nnx.Module):
     @property
     def reach(self) -> int:
         """Distance of the farthest pixel that an output pixel depends on."""
-        return _reach([self.first, *itertools.chain(*self.blocks), self.last])
+        return reach_of([self.first, *itertools.chain(*self.blocks), self.last])
 
     def __call__(
         self, unbiased: Image, biased: Image, variance: Variance, sure: Image
@@ -315,7 +268,7 @@ class MixingNetwork(nnx.Module):
         image = [compress(unbiased), compress(biased), *bounded]
         features = jax.nn.relu(self.first(jnp.concatenate(image, axis=-1)))
         for block in self.blocks:
-            features = features + _each(block, features)
+            features = features + apply_each(block, features)
         outputs = self.last(features)
         return outputs.reshape(*outputs.shape[:2], 3, 3)
 
@@ -387,31 +340,6 @@ class Joint(nnx.Module):
 def _compress_variance(variance: Array) -> Array:
     """Return the logarithm of a variance, steep where typical variances are."""
     return jnp.log1p(variance / _VARIANCE_UNIT)
-
-
-def _each(convolutions: Iterable[Convolution], image: Array) -> Array:
-    """Apply convolutions one after another, each with a ReLU."""
-    for convolution in convolutions:
-        image = jax.nn.relu(convolution(image))
-    return image
-
-
-def _reach(convolutions: Iterable[Convolution]) -> int:
-    """Return the reach of convolutions one after another."""
-    return sum(convolution.reach for convolution in convolutions)
-
-
-def _halved(image: Array) -> Array:
-    """Return the maximum of each block of 2x2 pixels."""
-    h, w, c = image.shape
-    return jnp.max(image.reshape(h // 2, 2, w // 2, 2, c), axis=(1, 3))
-
-
-def _doubled(image: Array) -> Array:
-    """Repeat each pixel as a block of 2x2."""
-    h, w, c = image.shape
-    blocks = jnp.broadcast_to(image[:, None, :, None], (h, 2, w, 2, c))
-    return blocks.reshape(2 * h, 2 * w, c)
 
 
 def _softmax(logits: Array, *, parts: int) -> Array:

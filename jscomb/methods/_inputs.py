@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame, Maker
 from jscomb.methods._table import BASES, METHODS
 from jscomb.typing import Key
@@ -70,8 +71,7 @@ def given_to(
         names, skipped = inputs(frame, biased=biased)
         if not names:
             raise ValueError(f"{method} has no bases: {_listed(skipped)}")
-        for name in names:
-            frame = with_input(key, frame, name)
+        frame = _with_inputs(key, frame, names)
         return frame, ({name: _maker(key, frame, name) for name in names},)
     name = input_name(frame, biased=biased)
     frame = with_input(key, frame, name)
@@ -143,6 +143,18 @@ def with_input(key: Key, frame: Frame, name: str) -> Frame:
             f"frame.with_estimate({name!r}, ...)"
         )
     return frame.with_estimate(name, method.estimate(key, frame))
+
+
+def _with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
+    """The frame with estimates, made if they are not there, some of them together."""
+    made = {n: METHODS[n].variant for n in names if n not in frame.estimates}
+    variants = {n: variant for n, variant in made.items() if variant is not None}
+    estimates = oidn.denoise_variants(frame, list(variants.values()))
+    for name, estimate in zip(variants, estimates, strict=True):
+        frame = frame.with_estimate(name, estimate)
+    for name in names:
+        frame = with_input(key, frame, name)
+    return frame
 
 
 def can_make(name: str, frame: Frame) -> bool:

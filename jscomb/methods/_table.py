@@ -27,6 +27,7 @@ class Method(NamedTuple):
             `Maker`), to an `Estimate`.
         denoiser: the denoiser that it runs by itself, where it takes no estimate.
         pure: decides on no values, for `jit` and `vmap`.
+        variant: of Open Image Denoise; those of one frame are made together.
     """
 
     summary: str
@@ -36,6 +37,7 @@ class Method(NamedTuple):
     make: Callable[..., Estimate] | None = None
     denoiser: str | None = None
     pure: bool = False
+    variant: oidn.Variant | None = None
 
     def image(self, key: Key, frame: Frame, *estimates: Any) -> Image:
         """Return the image alone, [H,W,C]."""
@@ -53,10 +55,11 @@ class Method(NamedTuple):
         return with_halves(frame, image, *given, needs=self.needs)
 
 
-def _denoiser(summary: str, needs: Needs, denoise: Callable[..., Estimate], **options):
-    """A method that denoises a frame as a whole."""
-    make = lambda key, frame: denoise(frame, **options)
-    return Method(summary, needs, "nothing", make=make)
+def _oidn(summary: str, name: str) -> Method:
+    """Open Image Denoise in one of its variants."""
+    variant = oidn.VARIANTS[name]
+    make = lambda key, frame: oidn.denoise_frame(frame, variant=variant)
+    return Method(summary, variant.needs, "nothing", make=make, variant=variant)
 
 
 def _filter(summary: str, room: Any) -> Method:
@@ -79,19 +82,24 @@ def _james_stein(summary: str, **options: Any) -> Method:
 
 
 METHODS: dict[str, Method] = {
-    "oidn": _denoiser(
-        "Open Image Denoise with the frame's albedo and normal",
-        oidn.NEEDS,
-        oidn.denoise_frame,
-    ),
-    "oidn-color": _denoiser(
-        "Open Image Denoise with the colour alone",
-        oidn.NEEDS,
-        oidn.denoise_frame,
-        features=False,
-    ),
-    "nfor": _denoiser(
-        "first-order regression on the features", nfor.NEEDS, nfor.denoise_frame
+    **{
+        name: _oidn(f"Open Image Denoise{summary}", name)
+        for name, summary in {
+            "oidn": " with the frame's albedo and normal",
+            "oidn-color": " with the colour alone",
+            "oidn-albedo": " with the albedo alone",
+            "oidn-demodulated": " of the colour divided by the albedo",
+            "oidn-clean": " with albedo and normal denoised first",
+            "oidn-clean-balanced": " with albedo and normal denoised first, smaller",
+            "oidn-turned": ", mean of eight flips and rotations",
+            "oidn-clean-turned": " as `oidn-clean`, mean of eight flips and rotations",
+        }.items()
+    },
+    "nfor": Method(
+        "first-order regression on the features",
+        nfor.NEEDS,
+        "nothing",
+        make=lambda key, frame: nfor.denoise_frame(frame),
     ),
     "bilateral": _filter("joint bilateral filter", bilateral),
     "nonlocal-means": _filter("non-local means", nonlocal_means),

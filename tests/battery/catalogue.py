@@ -50,6 +50,7 @@ class Entry(NamedTuple):
         degree: the power of the unit of radiance that its result is in.
         rounding: largest difference of float32 from float64, of the brightest pixel.
         backwards: whether gradients go through it, not only derivatives forwards.
+        ripple: largest relative difference of its result from a flat image.
         multiple: what crops have to start at multiples of.
     """
 
@@ -58,6 +59,7 @@ class Entry(NamedTuple):
     degree: int = 1
     rounding: float = 1e-5
     backwards: bool = True
+    ripple: float = 1e-5
     multiple: int = 1
 
 
@@ -356,10 +358,7 @@ def denoisers(*, window: int | None = None) -> dict[str, Entry]:
         ),
     }
     if oidn.available():
-        found["oidn.denoise"] = Entry(
-            lambda r: oidn.denoise(r.unbiased),
-            backwards=False,
-        )
+        found["oidn.denoise"] = Entry(lambda r: oidn.denoise(r.unbiased), ripple=0.06)
     return found
 
 

@@ -2,25 +2,7 @@
 
 import inspect
 
-from jscomb import (
-    double_shrinkage,
-    ensemble,
-    james_stein,
-    methods,
-    progressive,
-    uncorrelated,
-)
-from jscomb.denoisers import (
-    bilateral,
-    kernel_predicting,
-    nfor,
-    nonlocal_means,
-    oidn,
-    rdfc,
-    smoothing,
-)
-from jscomb.numerics import poisson, regression, simplex, sure
-from tests.battery import catalogue, parts
+from tests.battery import catalogue, parts, public
 
 ENTRIES = catalogue.combiners() | catalogue.denoisers() | catalogue.solvers()
 ELSEWHERE = {
@@ -56,6 +38,8 @@ ELSEWHERE = {
         "nfor.denoise_frame",
         "oidn.denoise_color",
         "oidn.denoise_frame",
+        "oidn.denoise_turns",
+        "oidn.denoise_variants",
         "progressive.combine_frame",
         "progressive.neural_combine_frame",
         "progressive.neural_inputs",
@@ -81,26 +65,18 @@ ELSEWHERE = {
         "simplex.reference",
         "simplex.reference_quadratic",
     },
-    "not of images": {"oidn.available"},
+    "of features, which have no unit": {"oidn.denoise_feature"},
+    "not of images": {"oidn.available", "oidn.pretrained"},
 }
+ROOMS = (
+    *("james_stein", "ensemble", "uncorrelated", "double_shrinkage", "progressive"),
+    *("methods", "denoisers"),
+    *("numerics.poisson", "numerics.regression", "numerics.simplex", "numerics.sure"),
+)
 MODULES = [
-    james_stein,
-    ensemble,
-    uncorrelated,
-    double_shrinkage,
-    progressive,
-    methods,
-    bilateral,
-    kernel_predicting,
-    nfor,
-    nonlocal_means,
-    oidn,
-    rdfc,
-    smoothing,
-    poisson,
-    regression,
-    simplex,
-    sure,
+    module
+    for name, module in public.modules().items()
+    if name.startswith(tuple(f"jscomb.{room}" for room in ROOMS))
 ]
 
 

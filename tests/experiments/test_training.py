@@ -85,10 +85,10 @@ def test_quick_training_lowers_the_validation_loss(method, crops, tmp_path):
     subprocess.run([*command, *options], env=optimised, cwd=ROOT, check=True)
     card = json.loads((config.out / "network.json").read_text())
     first, *_, last = card["losses"]["validation"]
-    assert last < 0.75 * first
+    assert last < 0.6 * first
     _, held = (train.prepare(method, frames) for frames in train.split(crops))
     beginning = train.relative_l2(method, untrained(method), held)
-    assert card["relative_l2"] < 0.85 * beginning
+    assert card["relative_l2"] < 0.7 * beginning
     assert card["frames"] == [6, 2]
     assert (tmp_path / "run" / "losses.png").stat().st_size > 1000
     before = (tmp_path / "run" / "network.safetensors").read_bytes()

@@ -1,0 +1,1 @@
+"""Open Image Denoise as a network, and its variants."""
