@@ -228,8 +228,17 @@ def test_invalid_pixels_do_not_decide(glass_frame):
 
 def test_an_ensemble_says_what_it_skips(glass_frame):
     names, skipped = methods.inputs(glass_frame.normalised())
-    assert set(names) == set(BASES if oidn.available() else BASES[2:4])
+    filters = {"bilateral", "rdfc"}
+    assert set(names) == (set(BASES) if oidn.available() else filters)
     assert not set(names) & set(skipped)
+    without = glass_frame.buffers._replace(albedo=None, normal=None)
+    names, skipped = methods.inputs(glass_frame._replace(buffers=without).normalised())
+    assert "oidn" in names
+    if oidn.available():
+        assert skipped.keys() == {*oidn.VARIANTS} & {*BASES} - {"oidn", "oidn-color"}
+        assert (
+            skipped["oidn-clean"] == "needs albedo, normal: render with these features"
+        )
     bare = glass_frame._replace(estimates={}).with_estimate("y", glass_frame.color)
     names, skipped = methods.inputs(bare.merged(1).normalised())
     assert names == ()

@@ -331,7 +331,7 @@ def test_what_was_found_is_kept(fresh):
     fresh.write_text(fresh.read_text().replace(str(found.error), "0.5"))
     assert _weights.identify(model).error == 0.5  # read, not compared again
     (version,) = json.loads(fresh.read_text())
-    for damaged in ("", "[]", "{", f'{{"{version}": [1]}}'):
+    for damaged in ("", "[]", "{", f'{{"{version}": [1]}}', f'{{"{version}": 2}}'):
         _weights._identified.cache_clear()
         fresh.write_text(damaged)
         assert _weights.identify(model).number == found.number

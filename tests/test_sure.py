@@ -193,5 +193,22 @@ def test_bad_input():
         run(v=VARIANCE[1:])
     with pytest.raises(ValueError, match="probes must be positive, got 0"):
         run(probes=0)
+    with pytest.raises(ValueError, match="slope_limit must be positive, got 0"):
+        run(slope_limit=0.0)
     with pytest.raises(ValueError, match="probe must be one of"):
         run(probe="cauchy")
+
+
+def test_slopes_beyond_the_limit_are_not_believed():
+    """Where they are within, nothing changes."""
+    x = jnp.array([1.0, 1.0, 1.0]).reshape(1, 3, 1)
+    v = jnp.array([4.0, 4.0, jnp.nan]).reshape(1, 3, 1)
+    steep = lambda image: jnp.array([[[0.5], [-30.0], [7.0]]]) * image
+    run = lambda limit: sure.monte_carlo_sure(
+        jax.random.key(0), steep, x, v, slope_limit=limit
+    )
+    np.testing.assert_allclose(run(None).divergence.ravel(), [2.0, -120.0, 0.0])
+    np.testing.assert_allclose(run(1.0).divergence.ravel(), [2.0, -4.0, 0.0])
+    np.testing.assert_allclose(
+        run(1.0).squared_error.ravel(), [0.25 + 4 - 4, 31.0**2 - 8 - 4, 0.0]
+    )

@@ -54,7 +54,7 @@ def difference(denoise: Callable, x: Image, b: Image, step: float) -> Image:
 def measure(frame: Frame, noise: float, draws: int) -> dict[str, list[float]]:
     """True error, and SURE by each way, for every draw."""
     assert frame.reference is not None
-    mu = jnp.maximum(frame.reference.image, 0.0)
+    mu = jnp.maximum(frame.reference.image, 0.0).astype(jnp.float32)
     deviation = noise * (mu + FLOOR)
     mean = lambda square: float(jnp.mean(square / (mu + FLOOR) ** 2))
     denoise = jax.jit(functools.partial(oidn.denoise_color, frame=frame))
@@ -62,7 +62,7 @@ def measure(frame: Frame, noise: float, draws: int) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {"true": []}
     for key in jax.random.split(jax.random.key(0), draws):
         of_noise, of_probe = jax.random.split(key)
-        x = mu + deviation * jax.random.normal(of_noise, mu.shape)
+        x = mu + deviation * jax.random.normal(of_noise, mu.shape, mu.dtype)
         b = deviation * jax.random.rademacher(of_probe, mu.shape, mu.dtype)
         y = denoise(x)
         moved = {"derivative": derivative(x, b)}

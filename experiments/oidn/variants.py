@@ -15,6 +15,7 @@ Every frame of the folder (`archives`), features and halves as they were rendere
 import dataclasses
 import functools
 import pathlib
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,8 @@ ENSEMBLES = {
     "features, clean": FEATURES + CLEAN,
     "features, clean, turned": FEATURES + CLEAN + TURNED,
     "features, clean, turned, pd": (*FEATURES, *CLEAN, *TURNED, "pd"),
-    "all, bilateral, rdfc": (*FEATURES, *CLEAN, *TURNED, "pd", *OTHERS),
+    "all": (*FEATURES, *CLEAN, *TURNED, "pd", *OTHERS),
+    "all but turned": (*FEATURES, *CLEAN, "pd", *OTHERS),
     "before: oidn, oidn-color, bilateral, rdfc, pd": (
         *("oidn", "oidn-color"),
         *("bilateral", "rdfc", "pd"),
@@ -84,7 +86,7 @@ def maps(frame: Frame, family: dict) -> dict[str, float]:
     half_a, half_b = frame.halves()
     denoise = functools.partial(oidn.denoise_color, frame=frame)
     risk = sure.monte_carlo_sure(
-        jax.random.key(0), denoise, frame.color, frame.variance
+        jax.random.key(0), denoise, frame.color, frame.variance, slope_limit=1.0
     )
     crossed = [
         jnp.square(halves[0] - half_b.color) - half_b.variance,
@@ -100,8 +102,8 @@ def maps(frame: Frame, family: dict) -> dict[str, float]:
     return {name: rank_correlation(blocks(found[name]), truth) for name in MAPS}
 
 
-def measure(frame: Frame) -> dict[str, float]:
-    """Errors of variants and ensembles, and correlations of maps."""
+def measure(frame: Frame, titles: Iterable[str]) -> dict[str, float]:
+    """Errors of variants and of some ensembles, and correlations of maps."""
     frame = frame._replace(estimates={})  # the archive's own has shared features
     names = list(oidn.VARIANTS)
     made = oidn.denoise_variants(frame, list(oidn.VARIANTS.values()))
@@ -111,8 +113,9 @@ def measure(frame: Frame) -> dict[str, float]:
         bases[name] = methods.METHODS[name].estimate(jax.random.key(0), frame)
     error = lambda image: errors.relative_l2(image, frame)
     row = {name: error(each.image) for name, each in bases.items()}
-    for title, some in ENSEMBLES.items():
-        mixed = ensemble.combine_frame(frame, {name: bases[name] for name in some})
+    for title in titles:
+        some = {name: bases[name] for name in ENSEMBLES[title]}
+        mixed = ensemble.combine_frame(frame, some)
         row[title] = error(mixed.image)
     return row | maps(frame, family)
 
@@ -129,8 +132,12 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: if the folder holds no archive.
     """
+    titles = [*ENSEMBLES]
+    measures = {"": functools.partial(measure, titles=[titles[0], titles[-1]])}
+    if not config.quick:
+        measures = {"": functools.partial(measure, titles=titles)}
     return archives.measured(
-        config.folder, {"": measure}, results=config.results, quick=config.quick
+        config.folder, measures, results=config.results, quick=config.quick
     )
 
 
@@ -144,24 +151,25 @@ def report(found: dict[str, dict[str, float]]) -> Report:
         the tables named above.
     """
     rows = list(found.values())
+    titles = [title for title in ENSEMBLES if title in rows[0]]
     baseline = lambda row: row["oidn"]
     alone = [*oidn.VARIANTS, "pd", *OTHERS]
     correlations = {name: [row[name] for row in rows] for name in MAPS}
     body = [
         errors.means(found, alone, baseline, title="one image / oidn"),
-        errors.means(found, list(ENSEMBLES), baseline, title="ensemble / oidn"),
+        errors.means(found, titles, baseline, title="ensemble / oidn"),
         table(
             ["map", "mean rank correlation", "least"],
             [[name, float(np.mean(c)), min(c)] for name, c in correlations.items()],
         ),
     ]
     ratios = {
-        name: [row[name] / row["oidn"] for row in rows] for name in (*alone, *ENSEMBLES)
+        name: [row[name] / row["oidn"] for row in rows] for name in (*alone, *titles)
     }
     mean = {name: errors.geometric_mean(each) for name, each in ratios.items()}
-    best = min(ENSEMBLES, key=mean.__getitem__)
+    best = min(titles, key=mean.__getitem__)
     single = min(oidn.VARIANTS, key=mean.__getitem__)
-    before = list(ENSEMBLES)[-1]
+    before = titles[-1]
     answer = (
         f"The best ensemble ({best}) has {mean[best]:.2f} of the error of `oidn` "
         f"(geometric mean of {len(rows)} frames; worst {max(ratios[best]):.2f}), that "

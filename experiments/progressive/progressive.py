@@ -82,7 +82,9 @@ def mixed(frame: Frame) -> dict[str, tuple[Image, Image]]:
     """Samples, denoised and mixed image, each with its estimated squared error."""
     x, v = frame.color, frame.variance
     denoise = functools.partial(oidn.denoise_color, frame=frame)
-    estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), denoise, x, v)
+    estimate = lambda v: sure.monte_carlo_sure(
+        jax.random.key(0), denoise, x, v, slope_limit=1.0
+    )
     y, s, _ = estimate(v)
     # To mix by, no pixel shall be more certain than those around it.
     robust = james_stein.robust_variance(v)

@@ -155,7 +155,9 @@ def measure(frame: Frame) -> dict[str, float]:
     x, v = frame.color, frame.variance
     error = lambda image: errors.relative_l2(image, frame)
     denoise = jax.jit(_oidn(frame))
-    estimate = lambda v: sure.monte_carlo_sure(jax.random.key(0), denoise, x, v)
+    estimate = lambda v: sure.monte_carlo_sure(
+        jax.random.key(0), denoise, x, v, slope_limit=1.0
+    )
     risk = estimate(v)
     y, s = risk.denoised, risk.squared_error
     weight = 1 / (jnp.square(jnp.mean(r, axis=-1, keepdims=True)) + 0.01)

@@ -68,6 +68,7 @@ def monte_carlo_sure(
     *,
     probes: int = 1,
     probe: Probe = "rademacher",
+    slope_limit: float | None = None,
 ) -> Risk:
     """Denoise, and estimate the squared error of every element of the result.
 
@@ -84,6 +85,9 @@ def monte_carlo_sure(
             of (F(x) - x)^2.
         probe: random signs, "rademacher" (usually better, and exact with one probe
             where each output depends on its own pixel alone), or "gaussian".
+        slope_limit: largest |J_ii| that is believed; None for any, which is unbiased. A
+            denoiser whose curve is steep near black has slopes there that the noise of
+            a rendering, which has no negative pixels, never meets.
 
     Returns:
         the denoised image, its estimated squared error, and the divergence. Pixels that
@@ -91,8 +95,8 @@ def monte_carlo_sure(
 
     Raises:
         ValueError: while tracing, if shapes differ, the denoiser changes the shape,
-            `probes` is not positive or the probe unknown; outside of `jit` also if the
-            variance is negative.
+            `probes` or the limit is not positive or the probe unknown; outside of `jit`
+            also if the variance is negative.
 
     Example:
         >>> x = jnp.full((4, 4, 1), 3.0)
@@ -107,6 +111,8 @@ def monte_carlo_sure(
         raise ValueError(f"probes must be positive, got {probes}")
     if probe not in get_args(Probe):
         raise ValueError(f"probe must be one of {get_args(Probe)}, got {probe!r}")
+    if slope_limit is not None and not slope_limit > 0:
+        raise ValueError(f"slope_limit must be positive, got {slope_limit}")
     deviation = _deviation(noisy, variance)
     draw = jax.random.rademacher if probe == "rademacher" else jax.random.normal
 
@@ -122,7 +128,11 @@ def monte_carlo_sure(
     if probes > 1:
         add = lambda total, key: (total + one(key)[1], None)
         total, _ = lax.scan(add, total, jax.random.split(others, probes - 1))
-    return _risk(noisy, variance, denoised, total / probes)
+    divergence = total / probes
+    if slope_limit is not None:
+        largest = slope_limit * jnp.square(deviation)
+        divergence = jnp.clip(divergence, -largest, largest)
+    return _risk(noisy, variance, denoised, divergence)
 
 
 def exact_sure(

@@ -22,6 +22,8 @@ from jscomb.typing import Image, Key
 
 Denoise = Callable[[Image, Frame], Any]
 
+_SLOPE_LIMIT = 1.0  # a denoiser averages: no pixel follows more than its own noise
+
 NEEDS = Needs(variance=True, normalised=True)
 
 
@@ -159,5 +161,6 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
     """
     frame.require("pd", NEEDS)
     x, v = frame.color, robust_variance(frame.variance)
-    y, s, _ = monte_carlo_sure(key, lambda color: denoise(color, frame), x, v)
+    one = lambda color: denoise(color, frame)
+    y, s, _ = monte_carlo_sure(key, one, x, v, slope_limit=_SLOPE_LIMIT)
     return {"unbiased": x, "biased": y, "variance": v, "sure": s}

@@ -30,6 +30,7 @@ from jscomb.typing import Image
 
 _DARK = 0.2  # an albedo below it is not divided out fully
 _BATCH = 2**23  # pixels, of images that are denoised by one call
+_AT_ONCE = 4  # of these, on an accelerator
 
 
 class Variant(NamedTuple):
@@ -311,5 +312,7 @@ def _filtered(model: Model, images: list[dict[str, Array]]) -> Sequence[Array]:
 
 
 def _mapped(images: dict[str, Array], *, model: Model) -> Array:
-    """Filter stacked images one after another."""
-    return lax.map(lambda one: _filter.run(model, one, EXPOSURE), images)
+    """Filter stacked images: a CPU is busy with one, other devices take several."""
+    at_once = None if jax.default_backend() == "cpu" else _AT_ONCE
+    one = lambda images: _filter.run(model, images, EXPOSURE)
+    return lax.map(one, images, batch_size=at_once)

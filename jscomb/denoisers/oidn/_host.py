@@ -8,6 +8,8 @@ import numpy as np
 
 from jscomb.denoisers.oidn._models import Model
 
+_MEMORY = 1024  # MiB that the filter may take; it cuts larger images into tiles
+
 _lock = threading.Lock()  # a filter has one configuration at a time
 
 
@@ -20,7 +22,7 @@ def run(model: Model, images: Mapping[str, np.ndarray], exposure: float) -> np.n
     import pyoidn
 
     inputs = {name: np.ascontiguousarray(images[name]) for name in model.inputs}
-    output = np.empty_like(inputs[model.inputs[0]])
+    output = np.full_like(inputs[model.inputs[0]], np.nan)
     kind = pyoidn.OIDN_FILTER_TYPE_RT
     if model.lightmap:
         kind = pyoidn.OIDN_FILTER_TYPE_RT_LIGHTMAP
@@ -39,11 +41,13 @@ def run(model: Model, images: Mapping[str, np.ndarray], exposure: float) -> np.n
             filter.set_bool("cleanAux", model.clean)
         if not model.bounded:
             filter.set_float("inputScale", exposure)
+        filter.set_int("maxMemoryMB", _MEMORY)
         filter.set_quality(qualities[model.quality])
         filter.commit()
         filter.execute()
-        if problem := _device().get_error():
-            raise RuntimeError(f"Open Image Denoise failed: {problem}")
+        problem = _device().get_error()
+    if problem or np.isnan(output).any():
+        raise RuntimeError(f"Open Image Denoise failed: {problem or 'it made NaN'}")
     return output
 
 

@@ -16,6 +16,7 @@ import importlib.metadata
 import importlib.util
 import json
 import math
+import mmap
 import os
 import pathlib
 import struct
@@ -58,7 +59,7 @@ class Found(NamedTuple):
 def network(model: Model) -> Any:
     """Return a model's network; None, with one warning, if it cannot be read."""
     found = identify(model)
-    return None if found is None else trained_networks()[found.number].network
+    return None if found is None else _loaded(found.number)
 
 
 def identify(model: Model) -> Found | None:
@@ -80,18 +81,34 @@ def _warn_once() -> None:
 
 
 @functools.cache
+def _loaded(number: int) -> Any:
+    """Return a network in float32.
+
+    Its weights are NumPy's: they outlive the trace that first asks for them.
+    """
+    wide = lambda array: np.ascontiguousarray(array, np.float32)
+    return jax.tree.map(wide, trained_networks()[number].network)
+
+
+@functools.cache
 def trained_networks() -> list[Any]:
     """Return all networks of the installed library, in its order, as `Trained`.
 
-    Their weights are NumPy's: they outlive the trace that first asks for them.
+    Their weights are views of the file, which is read where they are used.
     """
     from jscomb.denoisers.oidn._network import from_arrays
 
-    containers = [c for p in _libraries() for c in read_containers(p.read_bytes())]
+    containers = [c for p in _libraries() for c in read_containers(_mapped(p))]
     return [made for c in containers if (made := from_arrays(c)) is not None]
 
 
-def read_containers(data: bytes) -> list[dict[str, np.ndarray]]:
+def _mapped(path: pathlib.Path) -> mmap.mmap:
+    """Return a file as memory."""
+    with path.open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def read_containers(data: bytes | mmap.mmap) -> list[dict[str, np.ndarray]]:
     """Return the arrays of all containers in a file, by name.
 
     What begins like a container and is none is skipped.
@@ -123,7 +140,7 @@ def _read_container(data: memoryview) -> dict[str, np.ndarray]:
         if layout not in (b"x", b"oihw") or kind not in _TYPES:
             raise ValueError("an array of another kind")
         values = np.frombuffer(data, _TYPES[kind], math.prod(shape), offset)
-        arrays[str(name, "ascii")] = values.reshape(shape).astype(np.float32)
+        arrays[str(name, "ascii")] = values.reshape(shape)
     if not arrays:
         raise ValueError("no arrays")
     return arrays
@@ -136,14 +153,13 @@ def _identified(model: Model) -> Found | None:
     key = f"{_version()} {sum(path.stat().st_size for path in _libraries())}"
     known = _load(store)
     with contextlib.suppress(AttributeError, KeyError, TypeError, ValueError):
-        number, error, seconds = known[key][model.name]
-        return Found(int(number), float(error), float(seconds))
+        entry = known[key][model.name]
+        return Found(int(entry[0]), *map(float, entry[1:])) if entry else None
     with jax.ensure_compile_time_eval():
         found = _by_parity(model)
-    if found is not None:
-        before = known.get(key)
-        same = before if isinstance(before, dict) else {}
-        _save(store, known | {key: same | {model.name: list(found)}})
+    before = known.get(key)
+    same = before if isinstance(before, dict) else {}
+    _save(store, known | {key: same | {model.name: found or []}})
     return found
 
 
