@@ -13,6 +13,7 @@ from jscomb.frame import Needs
 from jscomb.numerics.convolution import doubled
 from jscomb.numerics.guards import finite
 from jscomb.numerics.luminance import median_luminance
+from jscomb.numerics.tiles import compiled
 from jscomb.numerics.windows import window_max, window_mean
 
 NEEDS = Needs(channels=3, normalised=True, package=_weights.PACKAGE)
@@ -102,8 +103,8 @@ def denoise(
         >>> if available():
         ...     assert jax.jit(denoise)(noisy).std() < 0.1 * noisy.std()
     """
-    image = _fill(_checked("color", color))  # first: a NaN would spread by the unit
-    unit = median_luminance(image)
+    image = compiled(_fill)(_checked("color", color))  # NaN would spread by the unit
+    unit = compiled(median_luminance)(image)
     options = {"clean": clean, "quality": quality}
     return unit * denoise_normalised(
         image / unit, albedo=albedo, normal=normal, **options
@@ -204,11 +205,11 @@ def color_model(features: tuple[str, ...], clean: bool, quality: Quality) -> Mod
 
 def guarded(name: str, image: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return an image that is finite and in its range, of the colour's shape."""
-    filled = _fill(jnp.asarray(image, jnp.float32))
-    if filled.shape != shape:
-        raise ValueError(f"{name} has shape {filled.shape}, not {shape}")
-    minimum = -1.0 if name == "normal" else 0.0
-    return jnp.clip(filled, minimum, _LARGEST if name == "color" else 1.0)
+    array = jnp.asarray(image, jnp.float32)
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+    limits = {"color": (0.0, _LARGEST), "albedo": (0.0, 1.0), "normal": (-1.0, 1.0)}
+    return jnp.clip(compiled(_fill)(array), *limits[name])
 
 
 def _checked(name: str, image: ArrayLike) -> Array:
