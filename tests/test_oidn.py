@@ -53,7 +53,7 @@ def test_frame_without_sub_buffers(frame):
 def test_another_colour_of_a_frame(frame, denoised):
     """It is denoised with the frame's features, in the frame's unit."""
     made = oidn.denoise_color(frame.color, frame)
-    np.testing.assert_array_equal(made, denoised.image)
+    assert relative(made, denoised.image) < 1e-5
     without = oidn.denoise_color(
         frame.color, frame, variant=oidn.VARIANTS["oidn-color"]
     )
@@ -137,11 +137,10 @@ def test_it_is_a_jax_function(frame, denoised):
     """Compiled, mapped, with both derivatives."""
     run = lambda x: oidn.denoise_color(x, frame)
     x = frame.color
-    np.testing.assert_allclose(jax.jit(run)(x), denoised.image, rtol=2e-5)
     both = jax.jit(jax.vmap(run))(jnp.stack([x, x[::-1]]))
-    np.testing.assert_allclose(both[0], denoised.image, rtol=2e-5)
     y, moved = jax.jit(lambda x, t: jax.jvp(run, (x,), (t,)))(x, x)
-    assert rel_l2(y, denoised.image) < 1e-8  # by the network
+    for made in (jax.jit(run)(x), both[0], y):  # by the filter or the network
+        assert relative(made, denoised.image) < 1e-5
     # Scaling the image scales the result, but for the network's own nonlinearity.
     assert rel_l2(moved, y) < 0.05
     pull = jax.jit(lambda x, t: jax.vjp(run, x)[1](t)[0])

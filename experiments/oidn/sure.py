@@ -46,7 +46,7 @@ class Config(Options):
 
 def difference(denoise: Callable, x: Image, b: Image, step: float) -> Image:
     """The derivative along b, by a central difference."""
-    relative = jnp.where(b == 0, 1.0, abs(b) / (x + 1))
+    relative = jnp.where(b == 0, 1.0, abs(b) / (abs(x) + 1))
     h = step / jnp.exp(jnp.mean(jnp.log(relative)))
     return (denoise(x + h * b) - denoise(x - h * b)) / (2 * h)
 

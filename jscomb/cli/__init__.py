@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import tyro
 
-from jscomb import methods, rendering
+from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
 from jscomb.cli._rendering import render, render_file
 from jscomb.cli._showing import compare, demo, info
@@ -69,7 +69,6 @@ def _use_compilation_cache() -> None:
     if jax.__version_info__ < (0, 10, 2):
         return  # it would warn about every program that it finds there
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        folder = os.path.join(cache, "jscomb", "xla")
-        jax.config.update("jax_compilation_cache_dir", folder)
+        programs = str(cache.folder() / "xla")
+        jax.config.update("jax_compilation_cache_dir", programs)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

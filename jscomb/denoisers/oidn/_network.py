@@ -46,7 +46,7 @@ class Network(nnx.Module):
         >>> print(sum(array.size for array in jax.tree.leaves(network)))
         320035
         >>> print(network.reach, jax.eval_shape(network, jnp.ones((16, 32, 9))).shape)
-        124 (16, 32, 3)
+        94 (16, 32, 3)
     """
 
     def __init__(self, key: Key, inputs: int, *, size: Size = "base"):
