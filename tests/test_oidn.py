@@ -232,6 +232,17 @@ def test_derivatives_in_image_and_weights(small_network):
     check_grads(lambda network: run(network, x), (small_network,), 1, eps=1e-7)
 
 
+def test_a_network_that_makes_too_much_stays_finite(small_network):
+    """As one may on the way of its tuning; also its derivative."""
+    strong = jax.tree.map(lambda a: (3 * a).astype(jnp.float32), small_network)
+    x = jax.random.exponential(jax.random.key(1), (8, 9, 3), jnp.float32)
+    run = lambda x: oidn.denoise_normalised(x, network=strong, quality="fast")
+    made, pull = jax.vjp(run, x)
+    assert made.max() > 1e6
+    assert np.isfinite(made).all()
+    assert np.isfinite(pull(jnp.ones_like(made))[0]).all()
+
+
 @pytest.mark.parametrize("name", _network.CURVES)
 def test_curves(name):
     """The inverse is one, both grow, and the slopes are finite from 0 to the top."""

@@ -90,7 +90,7 @@ METHODS: dict[str, Method] = {
             "oidn-albedo": " with the albedo alone",
             "oidn-demodulated": " of the colour divided by the albedo",
             "oidn-clean": " with albedo and normal denoised first",
-            "oidn-clean-balanced": " with albedo and normal denoised first, smaller",
+            "oidn-clean-balanced": " as `oidn-clean`, by smaller networks",
             "oidn-turned": ", mean of eight flips and rotations",
             "oidn-clean-turned": " as `oidn-clean`, mean of eight flips and rotations",
         }.items()

@@ -19,6 +19,7 @@ from jscomb.numerics.tiles import compiled, map_crops
 
 _STEP = 3e-4  # of a difference, relative to the typical pixel
 _COMPILED = 0.8  # network's part of the filter's time that is worth compiling it for
+_LARGEST = 2.0  # of radiance as the network makes it; the curve back would overflow
 _WHOLE = 2**21  # pixels; larger images are computed by crops
 _TILE = 1024  # pixels, its width
 
@@ -60,8 +61,9 @@ def _whole(network: Any, images: Images, *, model: Model, exposure: float) -> Ar
     positive = (image + 1) / 2 if model.signed else image
     shown = [forward(scale * positive)]
     shown += [(images[g] + 1) / 2 if g == "normal" else images[g] for g in guides]
-    made = jnp.maximum(network(jnp.concatenate(shown, axis=-1)), 0.0)
-    made = inverse(jnp.minimum(made, 1.0) if model.bounded else made) / scale
+    largest = 1.0 if model.bounded else _LARGEST
+    made = jnp.clip(network(jnp.concatenate(shown, axis=-1)), 0.0, largest)
+    made = inverse(made) / scale
     return 2 * made - 1 if model.signed else made
 
 
