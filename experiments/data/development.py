@@ -178,9 +178,7 @@ def _render(config: Config, scene: Scene) -> list[pathlib.Path]:
         out = config.out / f"{scene.name}-{spp}.exr"
         if not out.exists():
             settings = of(spp, seed=number * STREAMS)
-            render_file(
-                source, out, settings, reference_from=reference, denoise=False
-            )
+            render_file(source, out, settings, reference_from=reference, denoise=False)
         files.append(out)
     return files
 

@@ -21,7 +21,9 @@ One pixel's `<M>` is hardly more than noise, and its exact optimum follows the n
 is worse than the best base. `solver="multi-scale"` is better: it averages `<M>` over
 windows, and takes each window's mean as far as both halves agree on how it differs
 from that of the next larger window, up to the whole frame. With many samples weights
-are local, with few there is almost one weight a base for the frame.
+are local, with few there is almost one weight a base for the frame. A pixel whose half
+buffer is noisy has less weight in these means; weights vary slowly, so they are solved
+for in blocks of 4x4 pixels and interpolated.
 
 Consistent if one base is: its error vanishes as samples grow, and so does the minimum.
 
@@ -40,6 +42,7 @@ from jscomb.ensemble._combine import (
     filter_weights,
     one_hot,
     solve_weights,
+    spread,
 )
 from jscomb.ensemble._estimate import error_matrix, mse_matrix, true_matrix
 from jscomb.ensemble._frame import (
@@ -47,6 +50,7 @@ from jscomb.ensemble._frame import (
     Stacked,
     combine_frame,
     stack_estimates,
+    weigh_frame,
 )
 from jscomb.ensemble._selection import Selected, select_bases
 
@@ -63,6 +67,8 @@ __all__ = [
     "one_hot",
     "select_bases",
     "solve_weights",
+    "spread",
     "stack_estimates",
     "true_matrix",
+    "weigh_frame",
 ]

@@ -5,16 +5,21 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.ensemble._estimate import SCALES, Bases, check_bases, error_matrix
+from jscomb.ensemble._estimate import SCALES, error_matrix
+from jscomb.ensemble._evidence import Bases, check_bases
 from jscomb.numerics import simplex
 from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
+from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Key, Variance
 
 Guide = Float[Array, "h w _"]
+Blocks = Float[Array, "n rows columns _"]
 Solver = Literal["hull", "iterative", "reference", "multi-scale"]
+_SMOOTH = 2.0  # standard deviation, in blocks, of the filter of multi-scale weights
 
 
 def combine(
@@ -29,8 +34,11 @@ def combine(
     albedo: Guide | None = None,
     normal: Guide | None = None,
     solver_key: Key | None = None,
+    variance_a: Variance | None = None,
+    variance_b: Variance | None = None,
     windows: Sequence[int] = SCALES,
     shared: bool = True,
+    block: int = 4,
 ) -> Image:
     """Combine any number of bases by the weights of minimum estimated error.
 
@@ -50,8 +58,12 @@ def combine(
         albedo: guide of the filter, shape [H,W,3]; optional, as is the normal.
         normal: guide of the filter, shape [H,W,3].
         solver_key: of the iterative solver, a typed key.
+        variance_a: of "multi-scale", of x_a, see `error_matrix`; shape [H,W,C].
+        variance_b: of "multi-scale", of x_b, same shape.
         windows: of "multi-scale".
         shared: of "multi-scale", one weight for all channels.
+        block: of "multi-scale", width in pixels of the blocks whose weights are solved
+            for, and interpolated between them.
 
     Returns:
         the combined image, radiance, shape [H,W,C]; at a pixel where a base is not
@@ -80,8 +92,11 @@ def combine(
         albedo=albedo,
         normal=normal,
         solver_key=solver_key,
+        variance_a=variance_a,
+        variance_b=variance_b,
         windows=windows,
         shared=shared,
+        block=block,
     )
     return average(biased, weights)
 
@@ -117,8 +132,11 @@ def solve_weights(
     *,
     solver: Solver = "hull",
     solver_key: Key | None = None,
+    variance_a: Variance | None = None,
+    variance_b: Variance | None = None,
     windows: Sequence[int] = SCALES,
     shared: bool = True,
+    block: int = 4,
 ) -> Bases:
     """Solve for the weights of the bases at every pixel.
 
@@ -131,8 +149,12 @@ def solve_weights(
             "iterative" and "reference", the same by the paper's solver and by jaxopt;
             "multi-scale", ours: `quadratic` on `error_matrix`.
         solver_key: of the iterative solver, a typed key.
+        variance_a: of "multi-scale", of x_a, see `error_matrix`; shape [H,W,C].
+        variance_b: of "multi-scale", of x_b, same shape.
         windows: of "multi-scale".
         shared: of "multi-scale", one weight for all channels.
+        block: of "multi-scale", width in pixels of the blocks whose weights are solved
+            for, and interpolated between them.
 
     Returns:
         the weights, at least zero, of sum one, shape [N,H,W,C]; at an invalid pixel
@@ -153,9 +175,17 @@ def solve_weights(
     check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
     images = biased_a, biased_b, unbiased_a, unbiased_b
     if solver == "multi-scale":
-        matrix = error_matrix(*images, windows=windows, shared=shared)
-        weights = simplex.quadratic(matrix)
-        return jnp.broadcast_to(weights, biased_a.shape)
+        matrix = error_matrix(
+            *images,
+            variance_a=variance_a,
+            variance_b=variance_b,
+            windows=windows,
+            shared=shared,
+            block=block,
+        )
+        weights = _interpolated(simplex.quadratic(matrix), block)
+        height, width = biased_a.shape[1:3]
+        return jnp.broadcast_to(weights[:, :height, :width], biased_a.shape)
     _, *clean = zero_invalid(*images)
     if solver == "hull":
         return simplex.hull(*clean)
@@ -166,6 +196,28 @@ def solve_weights(
     if solver_key is None:
         raise ValueError("the iterative solver needs solver_key")
     return simplex.iterative(solver_key, *clean)
+
+
+def _interpolated(weights: Blocks, block: int) -> Bases:
+    """Weights of every pixel from those of blocks: smooth, without a seam."""
+    if block == 1:
+        return weights
+    window = 2 * round(2 * _SMOOTH) - 1
+    smooth = jax.vmap(lambda w: window_mean(w, window, sigma=_SMOOTH))(weights)
+    return _upsampled(_upsampled(smooth, block, axis=1), block, axis=2)
+
+
+def _upsampled(values: Array, factor: int, *, axis: int) -> Array:
+    """Linear interpolation between the middles of blocks, constant beyond the last."""
+    values = jnp.moveaxis(values, axis, 0)
+    before = jnp.concatenate([values[:1], values[:-1]])
+    after = jnp.concatenate([values[1:], values[-1:]])
+    parts = []
+    for offset in (np.arange(factor) + 0.5) / factor - 0.5:
+        other = before if offset < 0 else after
+        parts.append(values + abs(float(offset)) * (other - values))
+    fine = jnp.stack(parts, axis=1).reshape(-1, *values.shape[1:])
+    return jnp.moveaxis(fine, 0, axis)
 
 
 def one_hot(errors: Bases) -> Bases:
@@ -274,3 +326,23 @@ def average(biased: Bases, weights: Bases) -> Image:
     valid, clean = zero_invalid(biased)
     total = jnp.sum(weights * clean, axis=0)
     return jnp.where(valid, total, first_finite(*biased))
+
+
+def spread(biased: Bases, weights: Bases) -> Image:
+    """Return the weighted variance of the bases: where they disagree.
+
+    Args:
+        biased: y, radiance, shape [N,H,W,C].
+        weights: of sum one, shape [N,H,W,C].
+
+    Returns:
+        squared radiance, shape [H,W,C]; 0 at a pixel where a base is not finite.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> print(spread(at(1.0, 5.0), at(0.75, 0.25))[0, 0])
+        [3.]
+    """
+    valid, clean = zero_invalid(biased)
+    distance = jnp.square(clean - average(clean, weights)[None])
+    return jnp.where(valid, jnp.sum(weights * distance, axis=0), 0.0)

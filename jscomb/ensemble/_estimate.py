@@ -1,30 +1,24 @@
 """Error matrices of the bases from half buffers, of pixels and of windows."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import (
-    check_same_shape,
-    divide,
-    masked_mean,
-    safe_sqrt,
-    zero_invalid,
+from jscomb.ensemble._evidence import (
+    Bases,
+    Count,
+    Matrix,
+    Packed,
+    check_bases,
+    evidence_of,
+    pooled,
+    unpacked,
 )
-from jscomb.numerics.medians import median_of
-from jscomb.numerics.windows import window_mean
-from jscomb.typing import Image, Mask
+from jscomb.numerics.guards import divide, safe_sqrt
+from jscomb.typing import Image, Variance
 
-Bases = Float[Array, "n h w c"]
-Matrix = Float[Array, "n n h w _"]
-Packed = Float[Array, "h w _"]  # upper triangles of matrices
-
-# Added to squared radiances, of the frame's mean squared: limits black pixels.
-_FLOOR = 0.01
-SCALES = 11, 21, 41, 81
+SCALES = 29, 61
 
 
 def mse_matrix(
@@ -93,9 +87,12 @@ def error_matrix(
     unbiased_a: Image,
     unbiased_b: Image,
     *,
+    variance_a: Variance | None = None,
+    variance_b: Variance | None = None,
     windows: Sequence[int] = SCALES,
     whole_frame: bool = True,
     shared: bool = True,
+    block: int = 1,
 ) -> Matrix:
     """Estimate the error matrix over windows, as local as the halves agree.
 
@@ -109,15 +106,20 @@ def error_matrix(
         biased_b: y^b, made from half b.
         unbiased_a: x_a, shape [H,W,C].
         unbiased_b: x_b, same shape.
-        windows: widths in pixels, odd, ascending. One of them without `whole_frame`
-            gives the plain mean over that window.
-        whole_frame: the frame is the largest scale.
+        variance_a: of x_a, squared radiance, same shape: a noisy pixel of the half that
+            stands for the truth has less weight, as in weighted least squares. None for
+            equal weights.
+        variance_b: of x_b, same shape.
+        windows: widths in pixels of the windows that are averaged over, odd, ascending.
+        whole_frame: also average over the whole frame.
         shared: one matrix for all channels, else one for each.
+        block: width B in pixels of the blocks that have one matrix each; windows are
+            rounded to odd numbers of blocks.
 
     Returns:
         `<M>` in excess of the plain average's error and relative to the pixel's
-        radiance, without unit, shape [N,N,H,W,1], or [N,N,H,W,C] if not shared. At an
-        invalid pixel that of the pixels around it.
+        radiance, without unit, shape [N,N,H/B,W/B,1], rounded up, or [N,N,H/B,W/B,C] if
+        not shared. At an invalid pixel that of the pixels around it.
 
     Raises:
         ValueError: while tracing, if shapes differ, there is no base, or no scale.
@@ -134,29 +136,25 @@ def error_matrix(
     check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
     if not windows and not whole_frame:
         raise ValueError("error_matrix needs a window, or the whole frame")
-    a, b, valid = evidence_of(biased_a, biased_b, unbiased_a, unbiased_b, shared)
-    means = [
-        tuple(window_mean(half, window, mask=valid) for half in (a, b))
-        for window in windows
-    ]
+    a, b, count = evidence_of(
+        *(biased_a, biased_b, unbiased_a, unbiased_b, variance_a, variance_b),
+        shared=shared,
+        block=block,
+    )
+    scales: list[int | None] = [2 * round((w / block - 1) / 2) + 1 for w in windows]
     if whole_frame:
-        whole = lambda half: masked_mean(half, valid, per_channel=True)
-        means.append(tuple(jnp.broadcast_to(whole(h), h.shape) for h in (a, b)))
+        scales.append(None)
+    means = [tuple(pooled(half, count, scale) for half in (a, b)) for scale in scales]
     larger_a, larger_b = means[-1]
     kept = (larger_a + larger_b) / 2
-    pools = [*windows[1:], None]
-    for pool, (a, b) in reversed(
-        list(zip(pools, means, strict=False))[: len(means) - 1]
-    ):
-        share = _agreement(a - larger_a, b - larger_b, pool, valid)
+    for larger, (a, b) in reversed(list(zip(scales[1:], means[:-1], strict=True))):
+        share = _agreement(a - larger_a, b - larger_b, larger, count)
         kept = kept + share * ((a + b) / 2 - kept)
         larger_a, larger_b = a, b
     return unpacked(kept, len(biased_a))
 
 
-def _agreement(
-    a: Packed, b: Packed, pool: int | None, valid: Mask
-) -> Float[Array, "h w 1"]:
+def _agreement(a: Packed, b: Packed, scale: int | None, count: Count) -> Count:
     """The share of both halves' difference that is not noise, in [0, 1], [H,W,1]."""
     spread = jnp.mean(jnp.square(a) + jnp.square(b), axis=(0, 1), keepdims=True)
     # Each element relative to its spread, or those of a bad base would dominate.
@@ -164,83 +162,5 @@ def _agreement(
     a, b = (divide(i, spread, where=spread > 0) for i in (a, b))
     both = jnp.sum(a * b, axis=-1, keepdims=True)
     square = jnp.sum(jnp.square((a + b) / 2), axis=-1, keepdims=True)
-    if pool is None:
-        both, square = (
-            jnp.broadcast_to(jnp.mean(jnp.where(valid, i, 0.0)), i.shape)
-            for i in (both, square)
-        )
-    else:
-        both, square = (window_mean(i, pool, mask=valid) for i in (both, square))
+    both, square = (pooled(i, count, scale) for i in (both, square))
     return jnp.clip(divide(both, square, where=square > 0), 0.0, 1.0)
-
-
-class Evidence(NamedTuple):
-    """Upper triangles of <M> from each half, relative to the radiance.
-
-    In excess of the plain average's error, so that the noise of x, which is common to
-    all elements, does not dominate.
-
-    Attributes:
-        a: of <M>^a, [H,W,P*C] with P pairs; without unit.
-        b: of <M>^b, same shape.
-        valid: pixels that are finite in all images, [H,W,1].
-    """
-
-    a: Packed
-    b: Packed
-    valid: Mask
-
-
-def evidence_of(
-    biased_a: Bases,
-    biased_b: Bases,
-    unbiased_a: Image,
-    unbiased_b: Image,
-    shared: bool,
-) -> Evidence:
-    """Estimate <M>^a and <M>^b at every pixel, relative to its radiance.
-
-    Channels are averaged if `shared`; 0 at invalid pixels.
-    """
-    rows, columns = np.triu_indices(len(biased_a))
-    images = biased_a, biased_b, unbiased_a, unbiased_b
-    valid, y_a, y_b, x_a, x_b = zero_invalid(*images)
-    means = jnp.mean(y_a, axis=0), jnp.mean(y_b, axis=0)
-    # The median: one base may spread the glow of a light far beyond it.
-    typical = (median_of(y_a) + median_of(y_b)) / 2
-    bright = jnp.mean(typical, axis=-1, keepdims=True)
-    square = jnp.square(bright) + _FLOOR * jnp.square(masked_mean(bright, valid))
-    scale = jnp.broadcast_to(square, x_a.shape)
-
-    def one(y: Bases, mean: Image, truth: Image) -> Packed:
-        e = y - mean[None]
-        both = e[rows] * e[columns] + (e[rows] + e[columns]) * (mean - truth)[None]
-        both = divide(both, jnp.broadcast_to(scale[None], both.shape), where=both != 0)
-        if shared:
-            both = jnp.mean(both, axis=-1, keepdims=True)
-        return jnp.moveaxis(both, 0, 2).reshape(*valid.shape[:2], -1)
-
-    return Evidence(one(y_a, means[0], x_b), one(y_b, means[1], x_a), valid)
-
-
-def unpacked(upper: Packed, n: int) -> Matrix:
-    """Symmetric matrices [N,N,H,W,C] from their upper triangles."""
-    place = np.zeros((n, n), int)
-    place[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
-    pairs = jnp.moveaxis(upper.reshape(*upper.shape[:2], n * (n + 1) // 2, -1), 2, 0)
-    return pairs[np.maximum(place, place.T)]
-
-
-def check_bases(biased_a: Bases, biased_b: Bases, x_a: Image, x_b: Image) -> None:
-    """Raise unless there is a base and all images have one shape."""
-    check_same_shape(unbiased_a=x_a, unbiased_b=x_b)
-    for name, bases in {"biased_a": biased_a, "biased_b": biased_b}.items():
-        if bases.ndim != 4 or len(bases) == 0:
-            raise ValueError(
-                f"{name} must be [N,H,W,C] with at least one base, got {bases.shape}"
-            )
-        if bases.shape[1:] != x_a.shape or len(bases) != len(biased_a):
-            raise ValueError(
-                f"{name} has shape {bases.shape}, expected "
-                f"{(len(biased_a), *x_a.shape)}: unbiased_a has {x_a.shape}"
-            )

@@ -1,13 +1,14 @@
 """Ensembles of a frame's estimates."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from jscomb.ensemble._combine import Solver, average, filtered_weights
-from jscomb.ensemble._estimate import SCALES, Bases
+from jscomb.ensemble._estimate import SCALES
+from jscomb.ensemble._evidence import Bases
 from jscomb.ensemble._selection import select_bases
 from jscomb.frame import (
     Estimate,
@@ -19,7 +20,7 @@ from jscomb.frame import (
     with_halves,
 )
 from jscomb.numerics.tiles import compiled
-from jscomb.typing import Image, Key
+from jscomb.typing import Key
 
 NEEDS = Needs(halves=True)
 
@@ -89,6 +90,7 @@ def combine_frame(
     solver_key: Key | None = None,
     windows: Sequence[int] = SCALES,
     shared: bool = True,
+    block: int = 4,
 ) -> Estimate:
     """Combine any number of estimates by the weights of minimum estimated error.
 
@@ -105,6 +107,7 @@ def combine_frame(
         solver_key: of the iterative solver, a typed key.
         windows: of "multi-scale".
         shared: of "multi-scale", one weight for all channels.
+        block: of "multi-scale", see `solve_weights`.
 
     Returns:
         the ensemble, radiance in the frame's unit.
@@ -126,17 +129,26 @@ def combine_frame(
     Source: ED section 4; the multi-scale weights are ours.
     """
     frame.require("ensemble", NEEDS)
-    options = {"solver": solver, "filter": filter, "windows": tuple(windows)}
-    weigh = compiled(_ensemble, **options, shared=shared)
 
     def combined(part: Frame, given: Mapping[str, Estimate]) -> Estimate:
         """With both halves by the same weights."""
         bases = stack_estimates(given)
-        halves = [half.color for half in part.halves()]
+        a, b = part.halves()
         if select:
-            kept = np.array(select_bases(*bases[1:], *halves).kept)
+            kept = np.array(select_bases(*bases[1:], a.color, b.color).kept)
             bases = Stacked(*(images[kept] for images in bases))
-        return weigh(bases, *halves, part.albedo, part.normal, solver_key)
+        weights = _weigh(
+            part,
+            bases,
+            solver=solver,
+            filter=filter,
+            solver_key=solver_key,
+            windows=tuple(windows),
+            shared=shared,
+            block=block,
+        )
+        image, *halves = (compiled(average)(y, weights) for y in bases)
+        return Estimate(image, jnp.stack(halves))
 
     given = dict(estimates)
     if halves_possible(frame, given, needs=NEEDS):
@@ -145,31 +157,48 @@ def combine_frame(
     return combined(frame, estimates_of(frame, given))
 
 
-def _ensemble(
-    bases: Stacked,
-    unbiased_a: Image,
-    unbiased_b: Image,
-    albedo: Image | None,
-    normal: Image | None,
-    solver_key: Key | None,
-    *,
-    solver: Solver,
-    filter: bool,
-    windows: tuple[int, ...],
-    shared: bool,
-) -> Estimate:
-    """The ensembles of the full frame and of each half, with the same weights."""
-    weights = filtered_weights(
+def weigh_frame(frame: Frame, estimates: Mapping[str, Estimate]) -> Bases:
+    """Solve for the multi-scale weights of a frame's estimates.
+
+    Args:
+        frame: with half buffers; in any unit.
+        estimates: with halves, by name.
+
+    Returns:
+        the weights that `combine_frame` takes by default, in the order of the names,
+        shape [N,H,W,C].
+
+    Raises:
+        ValueError: if frame or estimates have no halves, or shapes differ.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> x = jnp.full((2, 8, 8, 1), 2.0)
+        >>> estimates = {"low": Estimate(x[0] - 1, x - 1), "high": Estimate(x[0], x)}
+        >>> print(weigh_frame(make_frame(x), estimates)[:, 0, 0, 0])
+        [0. 1.]
+
+    Source: ours.
+    """
+    frame.require("ensemble", NEEDS)
+    options = {"solver": "multi-scale", "filter": False, "windows": SCALES}
+    bases = stack_estimates(estimates)
+    return _weigh(frame, bases, **options, shared=True, block=4, solver_key=None)
+
+
+def _weigh(
+    frame: Frame, bases: Stacked, *, solver_key: Key | None, **options: Any
+) -> Bases:
+    """The weights of a frame's bases."""
+    a, b = frame.halves()
+    known = not Needs(variance=True).missing(a)
+    return compiled(filtered_weights, **options)(
         *bases,
-        unbiased_a,
-        unbiased_b,
-        solver=solver,
-        filter=filter,
-        albedo=albedo,
-        normal=normal,
+        a.color,
+        b.color,
+        variance_a=a.variance if known else None,
+        variance_b=b.variance if known else None,
+        albedo=frame.albedo,
+        normal=frame.normal,
         solver_key=solver_key,
-        windows=windows,
-        shared=shared,
     )
-    image, *halves = (average(y, weights) for y in bases)
-    return Estimate(image, jnp.stack(halves))

@@ -9,9 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jscomb.ensemble._estimate import Bases, Matrix, check_bases, evidence_of, unpacked
+from jscomb.ensemble._evidence import (
+    Bases,
+    Matrix,
+    check_bases,
+    evidence_of,
+    pooled,
+    unpacked,
+)
 from jscomb.numerics import simplex
-from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image
 
 _ROUNDING = 1e-6
@@ -91,8 +97,8 @@ def _halves(
 ) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Windowed error matrices of each half, then those of single pixels."""
     images = biased_a, biased_b, unbiased_a, unbiased_b
-    a, b, valid = evidence_of(*images, shared=True)
-    near = (window_mean(half, window, mask=valid) for half in (a, b))
+    a, b, count = evidence_of(*images, shared=True)
+    near = (pooled(half, count, window) for half in (a, b))
     n = len(biased_a)
     near_a, near_b, a, b = (unpacked(i, n) for i in (*near, a, b))
     return near_a, near_b, a, b

@@ -32,6 +32,7 @@ has the minimum expected error by Stein's lemma (whitened: each i over v_i).
 A window of fewer than three pixels cannot shrink and keeps x, and so does one without
 any variance. The whitened sum excludes pixels of variance 0.
 
+`combine_bands` shrinks what is left in bands of spatial scale.
 `cross_regression` makes a better biased image from two half buffers and a biased image
 of each; `worth_regressing` estimates whether it helps. `neural_combine` has a network
 that chooses the variances. Functions of frames end in `_frame`, and `regress`.
@@ -44,15 +45,18 @@ Sources:
     normal distribution", 1964 (the positive part).
 """
 
+from jscomb.james_stein._bands import combine_bands, reach_of_bands
 from jscomb.james_stein._combine import combine, combine_dual, reach
 from jscomb.james_stein._estimate import guide_noise, risk, worth_regressing
 from jscomb.james_stein._frame import (
+    BANDS_NEEDS,
     NEEDS,
     NEURAL_NEEDS,
     Regressed,
     combine_frame,
     neural_combine_frame,
     neural_inputs,
+    plan_bands,
     plan_frame,
     plan_neural,
     regress,
@@ -66,11 +70,13 @@ from jscomb.james_stein._regression import cross_regression
 from jscomb.numerics.variances import robust_variance, smooth_variance
 
 __all__ = [
+    "BANDS_NEEDS",
     "NEEDS",
     "NEURAL_NEEDS",
     "Parameters",
     "Regressed",
     "combine",
+    "combine_bands",
     "combine_dual",
     "combine_frame",
     "combine_inputs",
@@ -79,9 +85,11 @@ __all__ = [
     "neural_combine",
     "neural_combine_frame",
     "neural_inputs",
+    "plan_bands",
     "plan_frame",
     "plan_neural",
     "reach",
+    "reach_of_bands",
     "regress",
     "risk",
     "robust_variance",

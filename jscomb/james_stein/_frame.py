@@ -9,6 +9,7 @@ import numpy as np
 
 from jscomb.features import select, stack
 from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
+from jscomb.james_stein._bands import combine_bands, reach_of_bands
 from jscomb.james_stein._combine import combine, reach
 from jscomb.james_stein._estimate import COARSE, worth_regressing
 from jscomb.james_stein._neural import KERNEL, Network, combine_inputs
@@ -20,6 +21,8 @@ from jscomb.numerics.windows import reach_of
 from jscomb.typing import Image, Key, Variance
 
 NEEDS = Needs(variance=True)
+_EPSILON = 0.01  # squared radiance, of normalised frames
+BANDS_NEEDS = Needs(variance=True, normalised=True)
 NEURAL_NEEDS = Needs(variance=True, channels=3, normalised=True)
 
 
@@ -96,6 +99,33 @@ def _combine_pooled(
     else:
         v = smooth_variance(variance, window=window)
     return combine(x, y, v, window=window, whiten=whiten)
+
+
+def plan_bands(frame: Frame, estimate: Estimate) -> Local:
+    """Return `combine_bands` of the whitened combination, as a local function.
+
+    Args:
+        frame: normalised, with variance.
+        estimate: biased image.
+
+    Returns:
+        the function, its images and how far it sees.
+
+    Raises:
+        ValueError: if the frame has no variance or is not normalised.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> one = jnp.ones((3, 3, 1))
+        >>> frame = make_frame(one, variance=one).normalised()
+        >>> print(plan_bands(frame, Estimate(one)).halo)
+        25
+    """
+    frame.require("james_stein.plan_bands", BANDS_NEEDS)
+    first = plan_frame(frame, estimate)
+    rule = compiled(combine_bands, epsilon=_EPSILON)
+    refine = lambda i: rule(i[0], first.function(i), i[2])
+    return first._replace(function=refine, halo=first.halo + reach_of_bands())
 
 
 class Regressed(NamedTuple):

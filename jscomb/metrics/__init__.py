@@ -15,10 +15,13 @@ from jscomb.metrics._errors import (
     rmse,
     smape,
 )
+from jscomb.metrics._estimated import ErrorEstimate, estimate_error
 
 __all__ = [
     "Change",
+    "ErrorEstimate",
     "dssim",
+    "estimate_error",
     "flip",
     "hdr_flip",
     "mean_change",

@@ -52,7 +52,7 @@ def rel_l2(
             mask, reference=reference, half_difference=half_difference
         )
         square = square - jnp.square(difference) / 4
-    return mean(square / (_grey_square(reference) + epsilon), mask)
+    return mean(square / (grey_square(reference) + epsilon), mask)
 
 
 class Change(NamedTuple):
@@ -120,7 +120,7 @@ def rel_l2_change(
         check_same_shape(unbiased=x, candidates=z, baselines=y)
         middle = (z + y) / 2
         if limit is not None:
-            reach = limit * safe_sqrt(_grey_square(middle) + epsilon)
+            reach = limit * safe_sqrt(grey_square(middle) + epsilon)
             x = middle + jnp.clip(x - middle, -reach, reach)
         square = 2 * (z - y) * (middle - x)
         changes.append(mean_change(square, middle, epsilon=epsilon))
@@ -151,7 +151,7 @@ def mean_change(
     """
     check_same_shape(square=square, baseline=baseline)
     valid, square, baseline = zero_invalid(square, baseline)
-    weight = _grey_square(baseline) + epsilon
+    weight = grey_square(baseline) + epsilon
     change = jnp.mean(square / weight, axis=-1, keepdims=True)
     average = mean(change, valid)
     spread = mean(jnp.square(change - average), valid)
@@ -214,7 +214,7 @@ def smape(
     return mean(jnp.abs(image - reference) / scale, mask)
 
 
-def _grey_square(image: Image) -> Array:
+def grey_square(image: Image) -> Array:
     """Squared mean of a pixel's channels, [H,W,1]."""
     return jnp.square(jnp.mean(image, axis=-1, keepdims=True))
 

@@ -1,0 +1,151 @@
+"""What one half of a frame says of bases made from the other."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jscomb.numerics.guards import (
+    check_same_shape,
+    divide,
+    masked_mean,
+    weighted_ratio,
+    zero_invalid,
+)
+from jscomb.numerics.medians import median_of
+from jscomb.numerics.windows import window_mean, window_sum
+from jscomb.typing import Image, Mask, Variance
+
+Bases = Float[Array, "n h w c"]
+Matrix = Float[Array, "n n rows columns _"]
+Packed = Float[Array, "rows columns _"]  # upper triangles of matrices
+Count = Float[Array, "rows columns 1"]
+
+# Added to squared radiances, of the frame's mean squared: limits black pixels.
+_FLOOR = 0.01
+_NOISE = 10.0  # relative variance, times this, that halves the weight of a pixel
+_NOISE_WINDOW = 9  # pixels that it is averaged over
+
+
+class Evidence(NamedTuple):
+    """Upper triangles of <M> from each half, relative to the radiance, of blocks.
+
+    In excess of the plain average's error, so that the noise of x, which is common to
+    all elements, does not dominate.
+
+    Attributes:
+        a: of <M>^a, mean over each block, [H/B,W/B,P*C] with P pairs; without unit.
+        b: of <M>^b, same shape.
+        count: pixels of each block that are finite in all images, [H/B,W/B,1].
+    """
+
+    a: Packed
+    b: Packed
+    count: Count
+
+
+def evidence_of(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    variance_a: Variance | None = None,
+    variance_b: Variance | None = None,
+    *,
+    shared: bool,
+    block: int = 1,
+) -> Evidence:
+    """Estimate <M>^a and <M>^b in every block, relative to its radiance.
+
+    Channels are averaged if `shared`; 0 in blocks without a valid pixel.
+    """
+    rows, columns = np.triu_indices(len(biased_a))
+    images = biased_a, biased_b, unbiased_a, unbiased_b
+    valid, y_a, y_b, x_a, x_b = zero_invalid(*images)
+    # The median: one base may spread the glow of a light far beyond it.
+    typical = (median_of(y_a) + median_of(y_b)) / 2
+    bright = jnp.mean(typical, axis=-1, keepdims=True)
+    scale = jnp.square(bright) + _FLOOR * jnp.square(masked_mean(bright, valid))
+    count = _blocks(valid.astype(scale.dtype), block)
+
+    def one(y: Bases, truth: Image, variance: Variance | None) -> Packed:
+        weight = _weight(scale, variance, valid)
+        mean = jnp.mean(y, axis=0)
+        e = y - mean[None]
+        both = e[rows] * e[columns] + (e[rows] + e[columns]) * (mean - truth)[None]
+        if shared:
+            both = jnp.mean(both, axis=-1, keepdims=True)
+        sums = jax.vmap(functools.partial(_blocks, block=block))(weight[None] * both)
+        packed = jnp.moveaxis(sums, 0, 2).reshape(*count.shape[:2], -1)
+        return weighted_ratio(packed, count)
+
+    return Evidence(one(y_a, x_b, variance_b), one(y_b, x_a, variance_a), count)
+
+
+def _weight(
+    scale: Float[Array, "h w 1"], variance: Variance | None, valid: Mask
+) -> Float[Array, "h w 1"]:
+    """Of a pixel, the inverse of its squared radiance and of its noise around it.
+
+    Its noise is that of the half that stands for the truth: where a firefly makes that
+    noisy it says little of any base. The other half's noise must not matter: a firefly
+    that a base lets through would hide there.
+    """
+    if variance is None:
+        square = scale
+    else:
+        _, clean = zero_invalid(variance)
+        noise = jnp.mean(clean, axis=-1, keepdims=True)
+        relative = divide(noise, scale, where=valid & (scale > 0))
+        near = window_mean(relative, _NOISE_WINDOW, mask=valid)
+        square = scale * (1 + _NOISE * near)
+    return divide(jnp.ones_like(square), square, where=valid & (square > 0))
+
+
+def _blocks(image: Image, block: int) -> Packed:
+    """Sums over blocks, the last of a row or column as large as it is."""
+    height, width, channels = image.shape
+    if block == 1:
+        return image
+    below, right = -height % block, -width % block
+    padded = jnp.pad(image, ((0, below), (0, right), (0, 0)))
+    rows, columns = (height + below) // block, (width + right) // block
+    split = padded.reshape(rows, block, columns, block, channels)
+    return jnp.sum(split, axis=(1, 3))
+
+
+def pooled(values: Packed, count: Count, window: int | None) -> Packed:
+    """Means over windows of blocks, or over all of them, weighted by their pixels."""
+    if window is not None:
+        total, weight = (window_sum(i, window) for i in (values * count, count))
+        return weighted_ratio(total, weight)
+    total, weight = (
+        jnp.sum(i, axis=(0, 1), keepdims=True) for i in (values * count, count)
+    )
+    return jnp.broadcast_to(weighted_ratio(total, weight), values.shape)
+
+
+def unpacked(upper: Packed, n: int) -> Matrix:
+    """Symmetric matrices [N,N,H,W,C] from their upper triangles."""
+    place = np.zeros((n, n), int)
+    place[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
+    pairs = jnp.moveaxis(upper.reshape(*upper.shape[:2], n * (n + 1) // 2, -1), 2, 0)
+    return pairs[np.maximum(place, place.T)]
+
+
+def check_bases(biased_a: Bases, biased_b: Bases, x_a: Image, x_b: Image) -> None:
+    """Raise unless there is a base and all images have one shape."""
+    check_same_shape(unbiased_a=x_a, unbiased_b=x_b)
+    for name, bases in {"biased_a": biased_a, "biased_b": biased_b}.items():
+        if bases.ndim != 4 or len(bases) == 0:
+            raise ValueError(
+                f"{name} must be [N,H,W,C] with at least one base, got {bases.shape}"
+            )
+        if bases.shape[1:] != x_a.shape or len(bases) != len(biased_a):
+            raise ValueError(
+                f"{name} has shape {bases.shape}, expected "
+                f"{(len(biased_a), *x_a.shape)}: unbiased_a has {x_a.shape}"
+            )
