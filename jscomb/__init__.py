@@ -34,12 +34,11 @@ from jscomb import (
 )
 from jscomb.exr import read_frame
 from jscomb.frame import Estimate, Frame, make_frame
-from jscomb.methods import choose, combine
+from jscomb.methods import combine
 
 __all__ = [
     "Estimate",
     "Frame",
-    "choose",
     "combine",
     "denoisers",
     "double_shrinkage",

@@ -12,8 +12,9 @@ import pytest
 from jscomb import exr, metrics
 from jscomb.cli import _showing
 from jscomb.cli._showing import SHOWN
+from jscomb.exr._files import read_parts
 from jscomb.frame import Estimate
-from jscomb.methods import BASES, CANDIDATES, METHODS
+from jscomb.methods import BASES, METHODS, TIERS
 from jscomb.numerics.guards import finite
 from tests.conftest import DATA
 from tests.test_exr import layer, noise, write
@@ -32,13 +33,16 @@ def demonstrate(jscomb, folder, shown=SHOWN):
     status, out, _ = jscomb("demo", "--out", folder)
     assert status == 0
     few, many = errors_in(out, 0), errors_in(out, 1)
-    methods = {"path tracing", "chosen", *shown}
+    methods = {"path tracing", *shown, *_showing.TIERS}
     assert few.keys() == many.keys() == methods
     assert all(many[name] < few[name] for name in methods)
-    assert few["chosen"] in [few[name] for name in shown]
     assert {p.name for p in folder.iterdir()} == {
         "comparison.png",
-        *(f"cornell-glass-{n}-{m}.exr" for n in (64, 1024) for m in shown),
+        *(
+            f"cornell-glass-{n}-{m}.exr"
+            for n in (64, 1024)
+            for m in (*shown, *_showing.TIERS)
+        ),
     }
     assert os.fspath(folder.resolve()) in out
     return few, many
@@ -47,7 +51,8 @@ def demonstrate(jscomb, folder, shown=SHOWN):
 @pytest.mark.slow
 def test_demo(jscomb, tmp_path):
     for errors in demonstrate(jscomb, tmp_path / "demo"):
-        assert errors["chosen"] < errors["denoised"]
+        assert errors["best"] < errors["balanced"] < 1.05 * errors["fast"]
+        assert errors["fast"] < errors["denoised"]
 
 
 def test_demo_of_small_frames(jscomb, tmp_path, monkeypatch):
@@ -61,31 +66,26 @@ def test_demo_of_small_frames(jscomb, tmp_path, monkeypatch):
     monkeypatch.setattr(exr, "bundled", lambda: small)
     monkeypatch.setattr(_showing, "TIMED_RUNS", 1)
     monkeypatch.setattr(_showing, "SHOWN", SHOWN[:3])
-    monkeypatch.setattr(_showing, "choose", lambda *_: "whitened")
-    few, many = demonstrate(jscomb, tmp_path / "demo", SHOWN[:3])
-    assert few["chosen"] == few["whitened"] < few["denoised"]
-    assert many["chosen"] == many["whitened"] < many["denoised"]
+    monkeypatch.setattr(_showing, "TIERS", ("fast",))
+    for errors in demonstrate(jscomb, tmp_path / "demo", SHOWN[:3]):
+        assert errors["fast"] < errors["denoised"]
 
 
-@pytest.mark.parametrize("method", ["auto", *SHOWN, "bilateral", "ensemble"])
+@pytest.mark.parametrize("method", ["auto", "fast", *SHOWN, "bilateral", "ensemble"])
 def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     path = tmp_path / "out.exr"
     status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)
     assert status == 0
     if method == "auto":
-        said = re.findall(
-            r"^(\w+): estimated change of relative L2 ([-+][\d.e-]+) ±", out, re.M
-        )
-        changes = {name: float(change) for name, change in said}
-        assert changes.keys() == set(CANDIDATES) - {"denoised"}
-        method = re.search(r"(\w+) of oidn$", out, re.M)[1]
-        assert changes[method] < 0.9 * min(changes.values())
+        method = "best"
+        count = len(TIERS["best"].bases)
+        assert f"ensemble of {count} estimates: estimated relative L2 0." in out
     image = exr.read_image(path)
     r, noise = glass_frame.reference
     error = float(metrics.rel_l2(image, r, half_difference=noise))
     np.testing.assert_allclose(errors_in(out)[method], error, atol=6e-6)
     about = exr.read_provenance(path)
-    bases = {"bilateral": [], "ensemble": ["oidn", *BASES[1:]]}
+    bases = {"bilateral": [], "ensemble": [*BASES], "best": [*TIERS["best"].bases]}
     assert (about["method"], about["biased"]) == (method, bases.get(method, ["oidn"]))
     assert about["input"]["scene"] == "cornell-glass"
 
@@ -96,12 +96,20 @@ def test_combine_keeps_a_perfect_image(jscomb, tmp_path, glass_frame):
     frame = glass_frame._replace(estimates={})
     perfect = frame.with_estimate("perfect", Estimate(truth, np.stack([truth, truth])))
     exr.write_frame(tmp_path / "f.exr", perfect)
-    status, out, _ = jscomb("combine", tmp_path / "f.exr", "-o", tmp_path / "o.exr")
+    out = tmp_path / "o.exr"
+    command = ("combine", tmp_path / "f.exr", "-o", out, "--biased", "perfect")
+    status, said, _ = jscomb(*command)
     assert status == 0
-    assert "whitened: estimated change of relative L2 " in out
-    assert "denoised of perfect" in out
-    np.testing.assert_array_equal(exr.read_image(tmp_path / "o.exr"), truth)
-    assert exr.read_provenance(tmp_path / "o.exr")["method"] == "denoised"
+    assert "best of perfect, path-tracing" in said
+    error = lambda image: float(metrics.rel_l2(image, truth))
+    assert error(exr.read_image(out)) < 0.01 * error(frame.color)
+    about = exr.read_provenance(out)
+    assert about["method"] == "best"
+    mean, deviation = about["estimated relative L2"]
+    assert abs(mean) < 0.01 * error(frame.color) + 3 * deviation
+    (part,) = read_parts(os.fspath(out))
+    assert part.channels["error.Y"].shape == (64, 64)
+    np.testing.assert_allclose(part.channels["error.Y"].mean(), max(mean, 0), rtol=1e-3)
 
 
 def test_combine_with_a_file(jscomb, tmp_path, glass_frame):

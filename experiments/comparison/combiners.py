@@ -93,14 +93,14 @@ def _ensemble(frame: Frame, *, bases: tuple[str, ...]) -> Image:
     return ensemble.combine_frame(frame, made, select=True).image
 
 
-def _chosen(frame: Frame) -> Image:
-    """By the method that the halves choose."""
-    return methods.combine(jax.random.key(0), frame).image
-
-
 def _by(frame: Frame, *, method: str) -> Image:
     """As `jscomb combine --method` does."""
     return methods.plan(jax.random.key(0), frame, method=method).whole()
+
+
+def _of_tier(frame: Frame, *, name: str) -> Image:
+    """By a tier of the default method."""
+    return methods.combine(jax.random.key(0), frame, method=name).image
 
 
 def _pure(frame: Frame, scale: float, *, method: Method) -> Image:
@@ -159,5 +159,8 @@ def combiners() -> dict[str, Combiner]:
         "whitened, always y*": Combiner(_of(_regressed, stride=2, always=True), 3),
         "ensemble of 2": Combiner(_of(_ensemble, bases=FEW[:2]), 3),
         "ensemble of 4": Combiner(_of(_ensemble, bases=FEW), 3),
-        "chosen": Combiner(_chosen, 3),
+        **{
+            name: Combiner(_of(_of_tier, name=name), 1 if name == "fast" else 3)
+            for name in methods.TIERS
+        },
     }

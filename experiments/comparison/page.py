@@ -25,7 +25,7 @@ from experiments.common.command import tool
 from experiments.comparison import convergence, equal_time, pareto
 from experiments.comparison.combiners import combiners
 from experiments.comparison.sweep import Record, results
-from jscomb import exr, metrics
+from jscomb import exr, methods, metrics
 from jscomb.frame import Frame
 from jscomb.typing import Image
 
@@ -57,7 +57,7 @@ class Config:
         "njs",
         "pd",
         "dsc",
-        "chosen",
+        *methods.TIERS,
     )
     metric: str = "relative L2"
     quick: bool = False

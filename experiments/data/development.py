@@ -109,7 +109,10 @@ def run(config: Config) -> list[pathlib.Path]:
     ) as process:
         made = process.map(_render, [config] * len(chosen), chosen)
         files = list(tqdm(made, total=len(chosen), unit="scene", desc="development"))
-    rows = [(s.name, s.reference_spp, noise(f[0])) for s, f in zip(chosen, files)]
+    rows = [
+        (s.name, s.reference_spp, noise(f[0]))
+        for s, f in zip(chosen, files, strict=True)
+    ]
     print(table(["scene", "samples of the reference", "its own relative L2"], rows))
     return [path for paths in files for path in paths]
 

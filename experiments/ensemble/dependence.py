@@ -2,8 +2,8 @@
 
 With two sub-buffers both halves of an ensemble have the weights of the full frame,
 which know the noise of both; with four each half has weights of its own. Both are
-judged as `jscomb.choose` judges: by how much each half's relative L2 differs from that
-of Open Image Denoise, estimated from the other half. The reference tells what is true.
+judged by how much each half's relative L2 differs from that of Open Image Denoise,
+estimated from the other half. The reference tells what is true.
 What the estimate misses is the cost of the dependence; where it is below zero, the
 ensemble looks better than it is. Frames are files, or scenes that are rendered first.
 """

@@ -13,6 +13,7 @@ import pathlib
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import tyro
 
 from experiments.common import archives, errors
@@ -20,7 +21,7 @@ from experiments.common.command import Options, main
 from experiments.common.report import Report
 from experiments.common.tables import table
 from experiments.common.timing import medians
-from jscomb import james_stein, methods
+from jscomb import james_stein, methods, metrics
 from jscomb.frame import Frame
 from jscomb.numerics.windows import window_sum
 from jscomb.typing import Image
@@ -58,12 +59,15 @@ def _dual(frame: Frame) -> Image:
 def images_of(frame: Frame) -> dict[str, Image]:
     """Inputs and combinations by name."""
     key, y = jax.random.key(0), frame.estimates["oidn"].image
-    combined = {
-        name: methods.combine(key, frame, method=name, biased="oidn").image
+    made = {
+        name: methods.combine(key, frame, method=name, biased="oidn")
         for name in COMBINERS
     }
-    found = methods.choose(key, frame, biased="oidn", methods=["denoised", "whitened"])
-    chosen = combined["whitened"] if found.method == "whitened" else y
+    combined = {name: each.image for name, each in made.items()}
+    halves = made["whitened"].halves, frame.estimates["oidn"].halves
+    x = jnp.stack([half.color for half in frame.halves()])
+    change = metrics.rel_l2_change(*halves, x, limit=2.0)
+    chosen = combined["whitened"] if change.helps else y
     inputs = {"path tracing": frame.color, "oidn": y}
     return inputs | combined | {"auto": chosen, "dual": _dual(frame)}
 

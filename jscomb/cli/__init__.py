@@ -44,11 +44,12 @@ def _parse() -> Callable[[], None]:
         def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return lambda: command(*args, **kwargs)
 
-        doc = (command.__doc__ or "").replace("{methods}", listed)
+        doc = (command.__doc__ or "").replace("{methods}", listed(methods.METHODS))
+        doc = doc.replace("{tiers}", listed(methods.TIERS))
         bind.__doc__ = doc.replace("{scenes}", ", ".join(rendering.SCENES))
         return bind
 
-    listed = "; ".join(f"{n} ({m.summary})" for n, m in methods.METHODS.items())
+    listed = lambda table: "; ".join(f"{n} ({m.summary})" for n, m in table.items())
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

@@ -13,7 +13,7 @@ import tyro
 from tqdm import tqdm
 
 import jscomb
-from jscomb import exr, methods
+from jscomb import exr, methods, metrics
 from jscomb.cli import _tables as tables
 from jscomb.frame import Estimate, Frame
 from jscomb.numerics.tiles import Local, stream_crops, tile_within
@@ -28,7 +28,6 @@ _Budget = Annotated[float | None, tyro.conf.arg(metavar="SECONDS")]
 _Memory = Annotated[int, tyro.conf.arg(metavar="MIB")]
 AUTO = "auto"
 LARGE = 2**21  # pixels; larger frames are combined by crops
-SAMPLED = 512  # pixels along a side of each piece of a large frame that is judged
 
 
 def combine(
@@ -48,7 +47,7 @@ def combine(
     made of the same files in the same way, is not made again; a frame that cannot be
     combined is reported at the end, after all others.
 
-    Methods: {methods}.
+    Tiers of the default method: {tiers}. Methods: {methods}.
 
     Args:
         frames: EXR files of any known renderer, or Tungsten directories.
@@ -57,16 +56,17 @@ def combine(
         biased: EXR file of the biased image, its name within the frame, or a denoiser
             of the methods. By default the frame's only one; a frame without any is
             denoised by Open Image Denoise.
-        method: one of the methods, or auto: the one of minimum error estimated from the
-            half buffers, and whitened for a frame without them.
-        budget: seconds that the method chosen by auto may take; unlimited by default.
+        method: a tier, one of the methods, or auto: the best tier within the budget, an
+            ensemble whose weights the half buffers tell; for a frame without them the
+            tier fast.
+        budget: seconds that a tier may take, without compilation; unlimited by default.
         samples: samples a pixel, where the file does not say.
-        memory: mebibytes that combining may take beside the images; a large frame is
-            combined by crops as large as that allows.
+        memory: mebibytes that a method may take beside the images; a large frame is
+            combined by crops as large as that allows. A tier takes what it needs.
     """
     options = Options(biased, method, budget, samples, memory)
-    if method != AUTO and method not in methods.METHODS:
-        known = ", ".join([AUTO, *methods.METHODS])
+    if method not in (known := [AUTO, *methods.TIERS, *methods.METHODS]):
+        known = ", ".join(known)
         raise ValueError(f"--method {method}: expected one of {known}")
     if len(frames) == 1 and not out.is_dir():
         _combine_file(frames[0], out, options)
@@ -132,36 +132,69 @@ def _combine_file(path: Path, out: Path, options: Options) -> None:
     made_from = _made_from(path, options)
     try:
         frame, name = _with_biased(path, loaded, options.biased)
-        method, combined = _combined(frame, name, options)
-        made_of = _made_of(frame, name, method)
+        made = _combined(frame, name, options)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     provenance = {
         "jscomb": jscomb.__version__,
-        "method": method,
+        "method": made.method,
         "frame": path.name,
-        "biased": made_of,
+        "biased": made.bases,
         "made from": made_from,
         "input": exr.read_provenance(path) if path.is_file() else {},
     }
-    exr.write_image(out, combined, provenance=provenance)
-    of = f" of {', '.join(made_of)}" if made_of else ""
-    print(f"wrote {out}: {tables.size(loaded)}, {method}{of}")
+    error = None if made.error is None else made.error.map
+    if made.error is not None:
+        provenance["estimated relative L2"] = [float(i) for i in made.error[1:]]
+    exr.write_image(out, made.image, error=error, provenance=provenance)
+    of = f" of {', '.join(made.bases)}" if made.bases else ""
+    print(f"wrote {out}: {tables.size(loaded)}, {made.method}{of}")
     if loaded.reference is not None:
         held = {name: estimate.image for name, estimate in frame.estimates.items()}
-        images = {"input": loaded.color, **held, method: combined}
+        images = {"input": loaded.color, **held, made.method: made.image}
         tables.print_table({"relative L2": tables.errors(images, loaded)})
 
 
-def _combined(frame: Frame, name: str | None, options: Options) -> tuple[str, Image]:
-    """The method of a frame, and its image."""
+class Made(NamedTuple):
+    """An image, by which method or tier, of which estimates, and its error."""
+
+    method: str
+    image: Image
+    bases: list[str]
+    error: metrics.ErrorEstimate | None = None
+
+
+def _combined(frame: Frame, name: str | None, options: Options) -> Made:
+    """Combine a frame by a tier or a method."""
     key, method = jax.random.key(0), options.method
-    if method == AUTO:
-        method = choose(frame, name, options.budget)
+    if method == AUTO or method in methods.TIERS:
+        return by_tier(frame, None if method == AUTO else method, name, options.budget)
     if methods.METHODS[method].takes == "nothing":
         name = None
     local = methods.plan(key, frame, method=method, biased=name)
-    return method, _evaluated(local, options.memory * 2**20)
+    image = _evaluated(local, options.memory * 2**20)
+    return Made(method, image, _made_of(frame, name, method))
+
+
+def by_tier(
+    frame: Frame,
+    tier: str | None,
+    name: str | None = None,
+    budget: float | None = None,
+) -> Made:
+    """Combine a frame by a tier, and print what it is made of and its error."""
+    made = methods.combine_tier(
+        jax.random.key(0), frame, tier=tier, biased=name, budget=budget
+    )
+    if made.reason:
+        print(made.reason)
+    for skipped, reason in made.skipped.items():
+        print(f"{skipped}: skipped: {reason}")
+    if made.error is not None:
+        _, mean, deviation = made.error
+        count = f"ensemble of {len(made.bases)} estimates"
+        print(f"{count}: estimated relative L2 {mean:.2g} ± {deviation:.1g}")
+    return Made(made.tier, made.estimate.image, list(made.bases), made.error)
 
 
 def _made_of(frame: Frame, name: str | None, method: str) -> list[str]:
@@ -187,42 +220,6 @@ def _evaluated(local: Local, memory: int) -> Image:
     for where, part in tqdm(parts, total=count, unit="crop", disable=None):
         image[where] = part
     return jnp.asarray(image)
-
-
-def choose(frame: Frame, name: str | None, budget: float | None) -> str:
-    """Choose the method from the half buffers, and print the evidence."""
-    key = jax.random.key(0)
-    found = methods.choose(key, _sampled(frame), biased=name, budget=budget)
-    if not found.trials:
-        print(
-            f"{found.method}: without half buffers of the frame and the biased image "
-            "its error cannot be estimated"
-        )
-    for trial in found.trials:
-        print(f"{trial.method}: {_evidence(trial)}")
-    return found.method
-
-
-def _sampled(frame: Frame) -> Frame:
-    """The frame; for a large one, four pieces side by side, which suffice to judge."""
-    height, width = frame.color.shape[:2]
-    if height * width <= LARGE or min(height, width) < 2 * SAMPLED:
-        return frame
-    of = lambda size: np.concatenate(
-        [np.arange(SAMPLED) + (k * size - 2 * SAMPLED) // 4 for k in (1, 3)]
-    )
-    rows, columns = of(height), of(width)
-    cut = lambda leaf: leaf[..., rows, :, :][..., columns, :] if leaf.ndim > 2 else leaf
-    return jax.tree.map(cut, frame)
-
-
-def _evidence(trial: methods.Trial) -> str:
-    """What was found out about a method, in a line."""
-    if trial.change is None:
-        return f"skipped: {trial.reason}"
-    mean, error = map(float, trial.change)
-    late = f", skipped: {trial.reason}" if trial.reason else ""
-    return f"estimated change of relative L2 {mean:+.2g} ± {error:.1g}{late}"
 
 
 def _with_biased(

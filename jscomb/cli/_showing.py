@@ -13,7 +13,7 @@ import numpy as np
 
 from jscomb import exr, methods, metrics
 from jscomb.cli import _tables as tables
-from jscomb.cli._combining import FramePath, SampleCount, choose
+from jscomb.cli._combining import FramePath, SampleCount, by_tier
 from jscomb.denoisers import oidn
 from jscomb.exr import dialects
 from jscomb.frame import Frame, Reference
@@ -22,6 +22,7 @@ from jscomb.typing import Image
 
 TIMED_RUNS = 7
 SHOWN = "denoised", "james-stein", "whitened", "njs", "pd", "dsc"
+TIERS = tuple(methods.TIERS)
 _DEMO_FOLDER = Path("jscomb-demo")
 
 
@@ -43,13 +44,16 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     for name, frame in by_samples:
         spp = f"{tables.samples(frame)} spp"
         print(f"{spp}:")
-        chosen = choose(frame, None, None)
         combined, ms = _all_methods(frame)
+        for tier in TIERS:
+            start = time.perf_counter()  # of the second frame without compilation
+            combined[tier] = jax.block_until_ready(by_tier(frame, tier).image)
+            ms[tier] = f"{1e3 * (time.perf_counter() - start):.0f}"
         for method, image in combined.items():
             exr.write_image(out / f"{name}-{method}.exr", image)
-        images = {"path tracing": frame.color, **combined, "chosen": combined[chosen]}
+        images = {"path tracing": frame.color, **combined}
         table[spp] = tables.errors(images, frame)
-        shown.append((frame, {f"chosen: {chosen}": combined[chosen]}))
+        shown.append((frame, {TIERS[-1]: combined[TIERS[-1]]}))
     size = tables.size(by_samples[0][1])
     print(f"relative L2 of one scene, {size}, and the time of each step")
     tables.print_table({**table, "ms": ms})

@@ -53,6 +53,7 @@ def write_image(
     path: str | os.PathLike,
     image: ArrayLike,
     *,
+    error: ArrayLike | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> None:
     """Write one RGB image that every viewer reads.
@@ -60,6 +61,7 @@ def write_image(
     Args:
         path: EXR file; replaced atomically if it exists.
         image: linear radiance, [H,W,3].
+        error: its estimated relative squared error, [H,W,1]: the layer error.Y.
         provenance: where the image came from; anything that JSON can store.
 
     Returns:
@@ -67,7 +69,7 @@ def write_image(
 
     Raises:
         OSError: if the file cannot be written; `path` is unchanged.
-        ValueError: if the shape is not [H,W,3].
+        ValueError: if the shapes are not [H,W,3] and [H,W,1].
 
     Example:
         >>> import tempfile
@@ -80,4 +82,9 @@ def write_image(
     array = np.asarray(image, np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image must have shape [H,W,3], got {array.shape}")
-    write_frame(path, make_frame(array), provenance=provenance)
+    layers = {} if error is None else {"error": np.asarray(error)}
+    for layer in layers.values():
+        if layer.shape != (*array.shape[:2], 1):
+            raise ValueError(f"error is {layer.shape}, the image {array.shape}")
+    parts = native.to_parts(make_frame(array), provenance or {}, layers=layers)
+    write_parts(os.fspath(path), parts)

@@ -7,6 +7,8 @@
     NAME.a NAME.b   the same estimate made from each half
     reference       R G B, half_difference.R ...
 
+A combined image has its estimated error beside it, as error.Y of part a.
+
 Two attributes of the first part are JSON, because EXR's numeric attributes would mangle
 large integers and lists. `jscomb` stores the format version, the sample count, a CRC-32
 of each part and one of the two attributes; `provenance` stores where the file came
@@ -17,6 +19,8 @@ stored without it. Version 1 had no checksum of attributes and channel names.
 import json
 import string
 import zlib
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -38,15 +42,23 @@ Channels = dict[str, np.ndarray]  # pixels [H,W] by channel name
 
 
 def to_parts(
-    frame: Frame, provenance: dict[str, Any], half: tuple[str, ...]
+    frame: Frame,
+    provenance: dict[str, Any],
+    half: tuple[str, ...] = (),
+    layers: Mapping[str, ArrayLike] = MappingProxyType({}),
 ) -> list[Part]:
-    """Return the parts of a frame's file; `half` as for `exr.write_frame`."""
+    """Return the parts of a frame's file; `half` as for `exr.write_frame`.
+
+    Layers [H,W,1] are channels NAME.Y of the first part.
+    """
     _check(frame, half)
     letters = [*LETTERS[: frame.sub_buffers]]
     parts = {
         letter: _sub_buffer(frame.buffers, number, half)
         for number, letter in enumerate(letters)
     }
+    for name, image in layers.items():
+        parts["a"][f"{name}.Y"] = np.asarray(image, np.float32)[..., 0]
     for name, estimate in frame.estimates.items():
         _check_name(name, letters)
         parts[name] = _channels("estimates", estimate.image, half)

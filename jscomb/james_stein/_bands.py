@@ -1,18 +1,17 @@
 """Shrinkage of the difference of two renderings in bands of spatial scale.
 
-With r = (x - y) / s the difference relative to the radiance, G_k Gaussian filters of
-ascending width and G_(n+1) = 0, the bands sum to the smoothed difference,
+With r = (x - y) / s the difference relative to the radiance, G_0 the identity, G_k
+Gaussian filters of ascending width and none beyond the last, the bands sum to r,
 
     d_k = (G_k - G_(k+1)) r,    v_k = sum over the kernel's squares of v / s^2,
 
 and each is shrunk by the share of its power around the pixel that is not noise,
 
-    eta_k = (1 - t G_k v_k / G_k d_k^2)+,    x^ = y + s sum_k eta_k d_k.
+    eta_k = (1 - t <v_k> / <d_k^2>)+,    x^ = y + s sum_k eta_k d_k,
 
-A denoiser that lost a texture or an edge leaves it in the difference at one scale,
-where a window of all scales sees mostly noise. What is finer than G_1 is noise, and
-dropped: so this refines a y that is right where the noise vanishes, such as the result
-of `combine`.
+where <.> is the mean weighted by G_k (for the finest band by the widest filter). A
+denoiser that lost a texture or an edge leaves it in the difference at one scale, where
+a window of all scales sees mostly noise. Without noise the result is x.
 """
 
 from collections.abc import Sequence
@@ -91,7 +90,9 @@ def combine_bands(
     noise = divide(v, jnp.broadcast_to(square, v.shape), where=some)
     noise = jnp.mean(noise, axis=-1, keepdims=True)
 
-    kernels = [_gaussian(sigma) for sigma in sigmas]
+    gaussians = [_gaussian(sigma) for sigma in sigmas]
+    kernels = [np.ones(1), *gaussians]
+    around = [gaussians[-1], *gaussians]
     ones = valid.astype(x.dtype)
     mass = [separable_sum(ones, kernel) for kernel in kernels]
     filtered = [
@@ -107,7 +108,7 @@ def combine_bands(
         return weighted_ratio(total, mass[i] * mass[j])
 
     kept = jnp.zeros_like(difference)
-    for k, kernel in enumerate(kernels):
+    for k, kernel in enumerate(around):
         band, spread = filtered[k], covariance(k, k)
         if k + 1 < len(kernels):
             band = band - filtered[k + 1]

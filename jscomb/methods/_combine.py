@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import jax
 
 from jscomb.frame import Estimate, Frame, estimates_of
-from jscomb.methods._choose import choose
-from jscomb.methods._inputs import given_to, input_name, taken_by
+from jscomb.methods._inputs import given_to, input_name
 from jscomb.methods._table import METHODS
+from jscomb.methods._tiers import TIERS, combine_tier
 from jscomb.numerics.tiles import Local
 from jscomb.typing import Key
 
@@ -20,7 +20,7 @@ def combine(
     biased: str | Sequence[str] | None = None,
     budget: float | None = None,
 ) -> Estimate:
-    """Make the estimate of a frame by a method, or by the one that `choose` finds.
+    """Make the estimate of a frame by a method, or by the default one.
 
     Normalises the frame, and scales the result back. Some methods decide on values, so
     this is not for `jit`; the papers' own functions are, where their parts are.
@@ -28,17 +28,18 @@ def combine(
     Args:
         key: of random probes, a typed key.
         frame: in any unit.
-        method: a key of `METHODS`; None to choose.
+        method: a key of `METHODS`, or of `TIERS`, as `combine_tier` takes it; None for
+            the best tier within the budget.
         biased: the biased image to combine with: an estimate of the frame, or a
             denoiser of `METHODS`; several for an ensemble. None for the frame's only
             estimate, or Open Image Denoise if it has none; for an ensemble all of them
             and `BASES`.
-        budget: seconds that a chosen method may take for a half; None for any.
+        budget: seconds that a tier may take, without compilation; None for any.
 
     Returns:
         the estimate, in the frame's unit. Its halves are None where they cannot be
         made: `METHODS[method].needs.missing_for_halves(frame)` returns the reason. With
-        two sub-buffers the halves of an ensemble share its weights.
+        two sub-buffers, and in a tier, the halves of an ensemble share its weights.
 
     Raises:
         ValueError: if there is no such method or biased image, or the frame lacks what
@@ -56,20 +57,13 @@ def combine(
         [1.]
         [2.611]
     """
-    whole, halves = frame.normalised(), None
-    if method is None:
-        found = choose(key, whole, biased=biased, budget=budget)
-        method, halves = found.method, found.halves
-        biased = taken_by(method, biased)
+    if method is None or method in TIERS:
+        made = combine_tier(key, frame, tier=method, biased=biased, budget=budget)
+        return made.estimate
     if (unchanged := _unchanged(frame, method, biased)) is not None:
         return unchanged
-    whole, given = given_to(key, whole, method, biased)
-    chosen = METHODS[method]
-    if halves is None:
-        made = chosen.estimate(key, whole, *given)
-    else:
-        image = chosen.image(key, whole, *estimates_of(whole, given))
-        made = Estimate(image, halves)
+    whole, given = given_to(key, frame.normalised(), method, biased)
+    made = METHODS[method].estimate(key, whole, *given)
     assert whole.unit is not None
     return made if frame.unit is not None else made.scaled(whole.unit)
 

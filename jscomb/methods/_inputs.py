@@ -44,8 +44,7 @@ def inputs(
             has = frame.estimates[name].halves is not None
             reason = "" if has or can_make(name, frame) else "it has no halves"
         elif name in METHODS:
-            reason = METHODS[name].needs.missing_for_halves(frame)
-            reason = f"needs {reason}" if reason else ""
+            reason = _unfit(name, frame)
         else:
             raise ValueError(_unknown(name, frame))
         if reason:
@@ -53,6 +52,16 @@ def inputs(
         else:
             names.append(name)
     return tuple(names), skipped
+
+
+def _unfit(name: str, frame: Frame) -> str:
+    """Why a method cannot make an estimate with halves; empty if it can."""
+    missing = METHODS[name].needs.missing_for_halves(frame)
+    if not missing and METHODS[name].takes == "one estimate":
+        held = frame.estimates.get(_DENOISER)
+        if held is None or held.halves is None:
+            missing = METHODS[_DENOISER].needs.missing_for_halves(frame)
+    return f"needs {missing}" if missing else ""
 
 
 def given_to(
@@ -71,10 +80,12 @@ def given_to(
         names, skipped = inputs(frame, biased=biased)
         if not names:
             raise ValueError(f"{method} has no bases: {_listed(skipped)}")
-        frame = _with_inputs(key, frame, names)
+        frame = with_inputs(key, frame, names)
         return frame, ({name: _maker(key, frame, name) for name in names},)
     name = input_name(frame, biased=biased)
     frame = with_input(key, frame, name)
+    if not chosen.needs.halves and frame.estimates[name].halves is not None:
+        return frame, (frame.estimates[name],)  # its halves need no halves
     return frame, (_maker(key, frame, name),)
 
 
@@ -132,26 +143,27 @@ def _unknown(name: str, frame: Frame) -> str:
 
 
 def with_input(key: Key, frame: Frame, name: str) -> Frame:
-    """The frame with an estimate, made if it is not there."""
+    """The frame with an estimate, made if it is not there; a combiner's of `oidn`."""
     if name in frame.estimates:
         return frame
     method = METHODS[name]
-    frame.require(name, method.needs)
-    if method.takes != "nothing":
+    if method.takes == "estimates":
         raise ValueError(
-            f"{name} takes a biased image itself: make it first, and add it by "
+            f"{name} takes several estimates itself: make it first, and add it by "
             f"frame.with_estimate({name!r}, ...)"
         )
-    return frame.with_estimate(name, method.estimate(key, frame))
+    frame, given = given_to(key, frame, name, taken_by(name, _DENOISER))
+    return frame.with_estimate(name, method.estimate(key, frame, *given))
 
 
-def _with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
+def with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
     """The frame with estimates, made if they are not there, some of them together."""
     made = {n: METHODS[n].variant for n in names if n not in frame.estimates}
     variants = {n: variant for n, variant in made.items() if variant is not None}
-    estimates = oidn.denoise_variants(frame, list(variants.values()))
-    for name, estimate in zip(variants, estimates, strict=True):
-        frame = frame.with_estimate(name, estimate)
+    if variants:
+        estimates = oidn.denoise_variants(frame, list(variants.values()))
+        for name, estimate in zip(variants, estimates, strict=True):
+            frame = frame.with_estimate(name, estimate)
     for name in names:
         frame = with_input(key, frame, name)
     return frame

@@ -105,6 +105,13 @@ METHODS: dict[str, Method] = {
     "nonlocal-means": _filter("non-local means", nonlocal_means),
     "rdfc": _filter("non-local means restricted by the features", rdfc),
     "gaussian": _filter("Gaussian blur", smoothing),
+    "path-tracing": Method(
+        "the frame's own noisy image",
+        Needs(),
+        "nothing",
+        lambda key, frame: Local(lambda image: image, frame.color, 0),
+        pure=True,
+    ),
     "denoised": Method(
         "the biased image, unchanged",
         Needs(),
@@ -116,6 +123,13 @@ METHODS: dict[str, Method] = {
         "James-Stein with one variance a 15x15 window", window=15, whiten=False
     ),
     "whitened": _james_stein("James-Stein with a robust variance for each pixel"),
+    "multi-scale": Method(
+        "`whitened`, then James-Stein in bands of spatial scale",
+        james_stein.BANDS_NEEDS,
+        "one estimate",
+        lambda key, frame, y: james_stein.plan_bands(frame, y),
+        pure=True,
+    ),
     "progressive": Method(
         "mixing with Open Image Denoise by SURE",
         progressive.NEEDS._replace(channels=3, package=oidn.NEEDS.package),
@@ -162,14 +176,11 @@ METHODS: dict[str, Method] = {
 """By name; the cheaper first among the combiners. Uncorrelated kernels are not here:
 they combine two renderings (`uncorrelated.combine_frame`)."""
 
-CANDIDATES = "denoised", "whitened", "njs", "pd", "dsc"
-"""What `choose` chooses from, the cheapest first."""
-
 BASES = (
     *(name for name in oidn.VARIANTS if not oidn.VARIANTS[name].turned),
     *("bilateral", "rdfc", "pd"),
 )
-"""What an ensemble is made of beside a frame's own estimates; the variants of eight
+"""What `ensemble` is made of beside a frame's own estimates; the variants of eight
 turns lower its error little, and take eight times as long."""
 
 

@@ -173,6 +173,9 @@ def combiners() -> dict[str, Entry]:
             lambda r: shrink(*xyv(r), divergence=r.variance / 4),
             james_stein.reach(),
         ),
+        "james_stein.combine_bands": Entry(
+            lambda r: james_stein.combine_bands(*xyv(r))
+        ),
         "james_stein.combine_dual": Entry(
             lambda r: james_stein.combine_dual(*halves(r), r.variance),
             james_stein.reach(),
@@ -245,7 +248,8 @@ def combiners() -> dict[str, Entry]:
         ),
         **{
             f"methods.plan {name}": Entry(
-                lambda r, method=method: _plan(r, method).whole(), _reach(method)
+                _normalised(lambda r, method=method: _plan(r, method).whole()),
+                _reach(method),
             )
             for name, method in METHODS.items()
             # `denoised` returns its input; denoisers have entries of their own.

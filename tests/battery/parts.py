@@ -124,6 +124,12 @@ def parts() -> dict[str, Function]:
         "metrics.rel_l2_change": lambda r: metrics.rel_l2_change(
             jnp.stack(r[2:4]), jnp.stack(r[:2]), jnp.stack(r[:2])
         ),
+        "metrics.estimate_error": lambda r: metrics.estimate_error(
+            r.biased,
+            jnp.stack([r.biased_a, r.biased_b]),
+            jnp.stack([r.unbiased_a, r.unbiased_b]),
+            jnp.square(r.biased_a - r.biased_b) / 8,
+        ),
         "metrics.tone_map": lambda r: metrics.tone_map(r.unbiased),
     }
 
@@ -152,6 +158,7 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
             weights(r), r.biased, r.variance
         ),
         "ensemble.average": lambda r: ensemble.average(bases(r)[0], weights(r)),
+        "ensemble.spread": lambda r: ensemble.spread(bases(r)[0], weights(r)),
         "ensemble.one_hot": lambda r: ensemble.one_hot(jnp.square(bases(r)[0])),
         "double_shrinkage.unbiased_error": (
             lambda r: double_shrinkage.unbiased_error(*_of_radiance(r))

@@ -7,9 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.common import command
+from experiments.common import command, errors
 from experiments.comparison import (
-    choice,
     convergence,
     equal_time,
     page,
@@ -17,10 +16,11 @@ from experiments.comparison import (
     pixels,
     stability,
     sweep,
+    tiers,
 )
 from experiments.comparison.combiners import combiners
-from jscomb import metrics
-from jscomb.methods import CANDIDATES
+from jscomb import exr, metrics
+from jscomb.methods import METHODS
 
 FEW = ("path tracing", "oidn", "whitened")
 
@@ -189,15 +189,31 @@ def test_stability_of_what_has_no_network():
     assert f"finite in {len(found)} of {len(found)} trials" in said.answer
 
 
-def test_regret_is_relative_to_the_least(folder):
-    rows = choice.run(choice.Config(folder, quick=True))
-    (row,) = rows.values()
-    table = choice.ratios(rows)
-    chosen = CANDIDATES[int(row["chosen"])]
-    least = min(row[name] for name in CANDIDATES[:2])
-    np.testing.assert_allclose(table["chosen"], [row[chosen] / least])
-    said = choice.report(rows)
-    assert f"{row['denoised']:#.3g} |" in said.body
+def test_tiers_are_measured(glass_frame, tmp_path):
+    exr.write_frame(tmp_path / "cornell-glass-64.exr", glass_frame)
+    config = tiers.Config(tmp_path, tmp_path / "results.jsonl", quick=True)
+    (row,) = tiers.run(config).values()
+    better = min(row["path tracing"], row["oidn"])
+    assert row["fast"] < better
+    assert row["balanced"] < better
+    assert row["oidn-color change"] * (row["oidn-color"] - row["oidn"]) > 0
+    said = tiers.report(tiers.run(config))
+    assert f"fast {row['fast'] / better:.2f}" in said.answer
+    assert f"{row['balanced estimated']:#.3g} |" in said.body
+    parts = tiers.ablation(
+        glass_frame.normalised(),
+        {
+            name: METHODS[name].estimate(jax.random.key(0), glass_frame.normalised())
+            for name in ("oidn", "path-tracing")
+        },
+    )
+    frame = glass_frame.normalised()
+    alone = {
+        "without path-tracing": frame.estimates["oidn"].image,
+        "without oidn": frame.color,
+    }
+    for name, image in alone.items():
+        assert parts[name] == pytest.approx(errors.relative_l2(image, frame), rel=0.01)
 
 
 def test_changes_of_pixels_add_up(glass_frame):

@@ -1,0 +1,280 @@
+"""What are the tiers of the default method worth, and are they ever worse?
+
+Frames of `experiments.data.development`, which have four sub-buffers. Errors (relative
+L2 of the normalised frame, less the reference's noise) are divided by those of the
+better of path tracing and Open Image Denoise, frame by frame, and by those of its best
+single setting, the variant of least mean error over all frames.
+
+The constants of the tiers were set on five scenes (`UNSEEN` names those that are none
+of them), so the answer is of the others; all frames are in the tables.
+
+    tiers      the errors of every tier and of what it is made of.
+    ablation   of `best` without each of its estimates, without the noise in the
+               weights of pixels, with weights of one window.
+    estimate   the estimated error beside the true one: the factor between both, and
+               the rank correlation of the map with the true error over 8x8 blocks.
+    halves     the estimated change of relative L2 against `oidn` from halves, beside
+               the true one: slope, correlation and share of wrong signs.
+"""
+
+import dataclasses
+import functools
+import pathlib
+import time
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments.common import errors
+from experiments.common.command import Options, main
+from experiments.common.report import Report
+from experiments.common.results import Results
+from experiments.common.tables import table
+from experiments.data import development
+from jscomb import ensemble, exr, metrics
+from jscomb.denoisers import oidn
+from jscomb.frame import Estimate, Frame
+from jscomb.methods import METHODS, TIERS, combine_tier
+from jscomb.methods._inputs import inputs, with_inputs
+from jscomb.numerics.tiles import compiled
+from jscomb.typing import Image
+
+UNSEEN = "bathroom", "dining-room", "glass-of-water", "living-room-2", "veach-mis"
+BASELINES = "path tracing", "oidn"
+ALSO = "oidn-turned", "whitened", "njs", "dsc"
+BLOCK = 8
+_EPSILON = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(Options):
+    """What to measure.
+
+    Attributes:
+        folder: of development frames.
+        results: file that the frames' results are kept in; None to keep none.
+    """
+
+    folder: tyro.conf.Positional[pathlib.Path]
+    results: pathlib.Path | None = None
+
+
+def weighted(frame: Frame, estimates: Mapping[str, Estimate], **options) -> Image:
+    """An ensemble with other options than the default's."""
+    bases = ensemble.stack_estimates(estimates)
+    a, b = frame.halves()
+    options = {"variance_a": a.variance, "variance_b": b.variance, **options}
+    windows = options.pop("windows", (29, 61))
+    combine = compiled(
+        ensemble.combine, solver="multi-scale", filter=False, windows=windows
+    )
+    return combine(*bases, a.color, b.color, **options)
+
+
+def ablation(frame: Frame, estimates: dict[str, Estimate]) -> dict[str, float]:
+    """Errors of `best` with something taken away."""
+    error = lambda image: errors.relative_l2(image, frame)
+    found = {
+        f"without {name}": error(
+            weighted(frame, {n: e for n, e in estimates.items() if n != name})
+        )
+        for name in estimates
+    }
+    equal = weighted(frame, estimates, variance_a=None, variance_b=None)
+    found["pixels of equal weight"] = error(equal)
+    found["one window of 29"] = error(weighted(frame, estimates, windows=(29,)))
+    mean = jnp.mean(jnp.stack([e.image for e in estimates.values()]), axis=0)
+    return found | {"equal weights": error(mean)}
+
+
+def judged(frame: Frame, made: Estimate, found: metrics.ErrorEstimate) -> dict:
+    """The estimated error beside the true one."""
+    assert frame.reference is not None
+    r, noise = frame.reference
+    true = errors.relative_l2(made.image, frame)
+    weight = jnp.square(jnp.mean(r, axis=-1, keepdims=True)) + _EPSILON
+    square = jnp.square(made.image - r)
+    if noise is not None:
+        square = square - jnp.square(noise) / 4
+    maps = [_blocks(i) for i in (square / weight, found.map)]
+    ranks = [np.argsort(np.argsort(each)) for each in maps]
+    return {
+        "estimated": float(found.mean) / true,
+        "standard error": float(found.standard_error) / true,
+        "map": float(np.corrcoef(*ranks)[0, 1]),
+    }
+
+
+def _blocks(image: Image) -> np.ndarray:
+    """Mean over channels and blocks, as one row."""
+    height, width = (size // BLOCK * BLOCK for size in image.shape[:2])
+    grey = np.asarray(image, np.float64)[:height, :width].mean(axis=-1)
+    parts = grey.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    return parts.mean(axis=(1, 3)).ravel()
+
+
+def measure(frame: Frame, *, quick: bool) -> dict[str, float]:
+    """Everything of one normalised frame."""
+    key, error = jax.random.key(0), functools.partial(errors.relative_l2, frame=frame)
+    row = {"path tracing": error(frame.color)}
+    for tier in [*TIERS][: 2 if quick else None]:
+        start = time.perf_counter()
+        made = combine_tier(key, frame, tier=tier)
+        jax.block_until_ready(made.estimate.image)
+        row |= {
+            tier: error(made.estimate.image),
+            f"{tier} s": time.perf_counter() - start,
+        }
+        if made.error is not None:
+            of = judged(frame, made.estimate, made.error)
+            row |= {f"{tier} {name}": value for name, value in of.items()}
+    names, _ = inputs(frame, biased=[*TIERS["balanced" if quick else "best"].bases])
+    if not quick:
+        names = [*names, *ALSO]
+    frame = with_inputs(key, frame, names)
+    row |= {name: error(frame.estimates[name].image) for name in names}
+    x = jnp.stack([half.color for half in frame.halves()])
+    y = frame.estimates["oidn"]
+    for name in names:
+        z = frame.estimates[name]
+        if name != "oidn" and z.halves is not None:
+            change = metrics.rel_l2_change(z.halves, y.halves, x)
+            row[f"{name} change"] = float(change.mean)
+    if not quick:
+        best, _ = inputs(frame, biased=[*TIERS["best"].bases])
+        row |= ablation(frame, {name: frame.estimates[name] for name in best})
+    return row
+
+
+def run(config: Config) -> dict[str, dict[str, float]]:
+    """Measure all frames.
+
+    Args:
+        config: what to measure.
+
+    Returns:
+        numbers by "scene samples".
+
+    Raises:
+        ValueError: if the folder holds no frame.
+    """
+    kept, found = Results(config.results), {}
+    every = list(development.frames(config.folder))[: 1 if config.quick else None]
+    for scene, samples, path in tqdm(every, unit="frame"):
+
+        def one(path: pathlib.Path = path) -> dict[str, float]:
+            return measure(exr.read_frame(path).normalised(), quick=config.quick)
+
+        found[f"{scene} {samples}"] = kept.get(f"{scene} {samples}", one)
+    return found
+
+
+def report(found: dict[str, dict[str, float]]) -> Report:
+    """Say what was found.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        the tables named above.
+    """
+    first = next(iter(found.values()))
+    unseen = {n: r for n, r in found.items() if n.split()[0] in UNSEEN} or found
+    tiers = [tier for tier in TIERS if tier in first]
+    single = [n for n in (*oidn.VARIANTS,) if n in first]
+    better = lambda row: min(row[name] for name in BASELINES)
+    mean = lambda rows, name, base: errors.geometric_mean(
+        row[name] / base(row) for row in rows.values()
+    )
+    setting = min(single, key=lambda name: mean(found, name, lambda row: row["oidn"]))
+    by_setting = lambda row: row[setting]
+    alone = [n for n in METHODS if n in first and n not in tiers]
+    parts = [
+        n
+        for n in first
+        if n.startswith("without ")
+        or n in ("pixels of equal weight", "equal weights")
+        or n.startswith("one window")
+    ]
+    worst = lambda name: max(r[name] / better(r) for r in unseen.values())
+    said = [
+        f"{tier} {mean(unseen, tier, better):.2f} (worst {worst(tier):.2f}; over "
+        f"{setting} {mean(unseen, tier, by_setting):.2f})"
+        for tier in tiers
+    ]
+    answer = (
+        f"Relative L2 over the better of path tracing and OIDN, geometric mean of "
+        f"{len(unseen)} frames of scenes that set nothing: {', '.join(said)}."
+    )
+    title = lambda rows, of: errors.means(rows, [*tiers, *alone], of, title="method")
+    body = [
+        "Scenes that set nothing, over the better of path tracing and OIDN:",
+        title(unseen, better),
+        f"The same over {setting}:",
+        errors.means(unseen, tiers, by_setting, title="tier"),
+        "All scenes, over the better of path tracing and OIDN:",
+        title(found, better),
+        table(
+            ["frame", *tiers, "the best single method"],
+            [
+                [name, *(r[t] / better(r) for t in tiers), min(alone, key=r.get)]
+                for name, r in found.items()
+            ],
+        ),
+    ]
+    if parts:
+        complete = {n: r for n, r in found.items() if all(p in r for p in parts)}
+        of_best = lambda row: row["best"]
+        body += [
+            "`best` with less, over `best`:",
+            errors.means(complete, parts, of_best, title="ablation"),
+        ]
+    body.append(_estimates(found, tiers))
+    body.append(_changes(found, alone))
+    return Report(answer, "\n\n".join(body))
+
+
+def _estimates(found: Mapping[str, Mapping[str, float]], tiers: list[str]) -> str:
+    """How far estimated errors are from the true ones."""
+    rows = []
+    for tier in tiers:
+        some = [r for r in found.values() if f"{tier} estimated" in r]
+        if not some:
+            continue
+        ratio = np.array([max(r[f"{tier} estimated"], 1e-3) for r in some])
+        rows.append(
+            [
+                tier,
+                float(np.exp(np.mean(np.log(ratio)))),
+                float(np.exp(np.mean(np.abs(np.log(ratio))))),
+                float(ratio.min()),
+                float(ratio.max()),
+                float(np.mean([r[f"{tier} map"] for r in some])),
+            ]
+        )
+    header = ["tier", "estimated / true", "factor between", "least", "most"]
+    return table([*header, "rank correlation of the map"], rows)
+
+
+def _changes(found: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
+    """How estimated changes against `oidn` go with the true ones."""
+    rows = []
+    for name in names:
+        some = [r for r in found.values() if f"{name} change" in r]
+        if len(some) < 2:
+            continue
+        # Relative, or the frames of few samples would decide.
+        said = np.array([r[f"{name} change"] / r["oidn"] for r in some])
+        true = np.array([(r[name] - r["oidn"]) / r["oidn"] for r in some])
+        slope = float(np.sum(said * true) / np.sum(true**2))
+        wrong = float(np.mean(np.sign(said) != np.sign(true)))
+        rows.append([name, slope, float(np.corrcoef(said, true)[0, 1]), wrong])
+    return table(["change against oidn", "slope", "correlation", "wrong signs"], rows)
+
+
+if __name__ == "__main__":
+    main(Config, run, report)
