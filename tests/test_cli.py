@@ -102,11 +102,11 @@ def test_combine_keeps_a_perfect_image(jscomb, tmp_path, glass_frame):
     assert status == 0
     assert "best of perfect, path-tracing" in said
     error = lambda image: float(metrics.rel_l2(image, truth))
-    assert error(exr.read_image(out)) < 0.01 * error(frame.color)
+    assert error(exr.read_image(out)) < 0.03 * error(frame.color)
     about = exr.read_provenance(out)
     assert about["method"] == "best"
     mean, deviation = about["estimated relative L2"]
-    assert abs(mean) < 0.01 * error(frame.color) + 3 * deviation
+    assert abs(mean) < 0.03 * error(frame.color) + 3 * deviation
     (part,) = read_parts(os.fspath(out))
     assert part.channels["error.Y"].shape == (64, 64)
     np.testing.assert_allclose(part.channels["error.Y"].mean(), max(mean, 0), rtol=1e-3)
@@ -119,8 +119,8 @@ def test_combine_with_a_file(jscomb, tmp_path, glass_frame):
         "combine", GLASS, "--biased", biased, "--out", tmp_path / "out.exr"
     )
     assert status == 0
-    assert "whitened of flat.exr" in out
-    assert "whitened: without half buffers of the frame and the biased" in out
+    assert "fast of flat.exr" in out
+    assert "best: no estimate has halves" in out
     named = jscomb("combine", GLASS, "--biased", "oidn", "-o", tmp_path / "named.exr")
     assert named[0] == 0
 
@@ -137,7 +137,7 @@ def test_combine_denoises_what_is_not(jscomb, tmp_path, glass_frame):
     frame = write(tmp_path / "pbrt.exr", channels, samplesPerPixel=64)
     status, out, _ = jscomb("combine", frame, "-o", tmp_path / "out.exr")
     assert status == 0
-    assert "whitened of oidn" in out
+    assert "fast of oidn" in out
     r, noise = f.reference
     status, out, _ = jscomb("compare", tmp_path / "out.exr", GLASS)
     expected = float(
@@ -275,7 +275,7 @@ BAD = {
     "no samples": (moments, [], r"moments\.exr: .*give the samples a pixel"),
     "several": (
         several,
-        [],
+        ["--method", "whitened"],
         r"two\.exr: which biased image\? this frame has oidn, other",
     ),
     "count": (lambda d: GLASS, ["--samples", "-5"], "samples must be at least 1"),

@@ -68,7 +68,12 @@ def by_hand(frame, estimates):
             lambda e: e.halves[1],
         )
     )
-    weights = multi_scale(a, b, *(half.color for half in frame.halves()))
+    first, second = frame.halves()
+    weights = multi_scale(
+        *(a, b, first.color, second.color),
+        variance_a=first.variance,
+        variance_b=second.variance,
+    )
     return [jnp.sum(weights * bases, axis=0) for bases in (full, a, b)]
 
 

@@ -11,6 +11,7 @@ from jscomb.frame import Estimate, Needs, make_frame
 from jscomb.methods import BASES, METHODS, TIERS, Method, combine_tier
 from jscomb.numerics.tiles import Local
 from tests.battery import catalogue
+from tests.conftest import DATA
 
 CHEAP = ["oidn", "multi-scale", "path-tracing"]
 key = lambda: jax.random.key(0)
@@ -118,25 +119,21 @@ def test_the_pages_hold_the_table():
 
 @needs_oidn
 @pytest.mark.parametrize("tier", slow_ones(TIERS, slow=("best",)))
-def test_a_tier_is_better_than_what_it_is_made_of(tier, real_frame):
-    """On a rendered frame that set no constant of it."""
-    frame = real_frame.normalised()
-    made = combine_tier(key(), frame, tier=tier)
-    assert made.tier == tier
-    assert not made.reason
-    assert error(made.estimate.image, frame) < 0.95 * min(
-        error(frame.color, frame), error(frame.estimates["oidn"].image, frame)
-    )
-    assert set(made.bases) | set(made.skipped) == {
-        *TIERS[tier].bases,
-        *(frame.estimates if made.error is not None else ()),
-    }
-    scaled = combine_tier(key(), frame.scaled(3.0)._replace(unit=None), tier=tier)
-    np.testing.assert_allclose(
-        scaled.estimate.image / 3, made.estimate.image, rtol=1e-3, atol=1e-4
-    )
-    by_name = combine(key(), frame, method=tier)
-    np.testing.assert_array_equal(by_name.image, made.estimate.image)
+def test_a_tier_is_better_than_what_it_is_made_of(tier):
+    """On two crops of rendered frames: on average, and never much worse."""
+    ratios = []
+    for name in ("cornell-glass-64", "cornell-box-64"):
+        frame = exr.read_frame(DATA / f"{name}.exr").normalised()
+        made = combine_tier(key(), frame, tier=tier)
+        assert (made.tier, made.reason) == (tier, "")
+        ends = frame.color, frame.estimates["oidn"].image
+        better = min(error(image, frame) for image in ends)
+        ratios.append(error(made.estimate.image, frame) / better)
+        assert {*made.bases, *made.skipped} == {*TIERS[tier].bases}
+        by_name = combine(key(), frame, method=tier)
+        np.testing.assert_array_equal(by_name.image, made.estimate.image)
+    assert max(ratios) < 1.05
+    assert np.prod(ratios) ** 0.5 < 0.8
 
 
 @needs_oidn
@@ -183,9 +180,9 @@ def test_a_tier_is_consistent(samples, real_frame):
     """With known noise on the truth, at many samples no worse than path tracing."""
     truth = real_frame.normalised().reference.image
     deviation = jnp.sqrt(jnp.square(truth) + 0.1)
-    noise = jax.random.normal(key(), (2, *truth.shape))
-    color = truth + deviation * noise * (2 / samples) ** 0.5
-    variance = jnp.broadcast_to(jnp.square(deviation) * 2 / samples, color.shape)
+    noise = jax.random.normal(key(), (2, *truth.shape), truth.dtype)
+    color = truth[None] + deviation[None] * noise * (2 / samples) ** 0.5
+    variance = 0 * color + jnp.square(deviation)[None] * 2 / samples
     y = 0.99 * truth + 0.01 * jnp.roll(truth, 1, axis=0)
     biased = Estimate(y, jnp.stack([y, y]))
     frame = make_frame(color, variance=variance, estimates={"oidn": biased})

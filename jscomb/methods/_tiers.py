@@ -120,7 +120,7 @@ def combine_tier(
         wanted = biased or [*whole.estimates, *TIERS[tier].bases]
         wanted = [wanted, "path-tracing"] if isinstance(wanted, str) else wanted
         names, skipped = inputs(whole, biased=wanted)
-        if names and whole.sub_buffers > 1:
+        if whole.sub_buffers > 1 and set(names) - {"path-tracing"}:
             made = _ensemble(key, whole, names)
             made = made._replace(tier=tier, skipped=skipped, reason=reason)
             return _scaled(made, frame, whole)

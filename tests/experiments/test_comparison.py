@@ -200,20 +200,13 @@ def test_tiers_are_measured(glass_frame, tmp_path):
     said = tiers.report(tiers.run(config))
     assert f"fast {row['fast'] / better:.2f}" in said.answer
     assert f"{row['balanced estimated']:#.3g} |" in said.body
-    parts = tiers.ablation(
-        glass_frame.normalised(),
-        {
-            name: METHODS[name].estimate(jax.random.key(0), glass_frame.normalised())
-            for name in ("oidn", "path-tracing")
-        },
-    )
     frame = glass_frame.normalised()
-    alone = {
-        "without path-tracing": frame.estimates["oidn"].image,
-        "without oidn": frame.color,
-    }
-    for name, image in alone.items():
-        assert parts[name] == pytest.approx(errors.relative_l2(image, frame), rel=0.01)
+    x = METHODS["path-tracing"].estimate(jax.random.key(0), frame)
+    y = frame.estimates["oidn"]
+    parts = tiers.ablation(frame, {"x": x, "y": y})
+    for name, other in (("without x", y), ("without y", x)):
+        alone = errors.relative_l2(other.image, frame)
+        assert parts[name] == pytest.approx(alone, rel=1e-4)
 
 
 def test_changes_of_pixels_add_up(glass_frame):
