@@ -302,3 +302,109 @@ def test_bad_input(truth):
         run(*images, solver="iterative")
     with pytest.raises(ValueError, match="needs a window, or the whole frame"):
         ensemble.error_matrix(*images[1:], windows=(), whole_frame=False)
+
+
+def by_loops(y_a, y_b, x_a, x_b, v_a, v_b, block):
+    """Upper triangles of each half's block means, pixel by pixel in float64."""
+    n, height, width, _ = y_a.shape
+    grey = (np.median(y_a, axis=0) + np.median(y_b, axis=0)).mean(-1) / 2
+    scale = grey**2 + 0.01 * grey.mean() ** 2
+    found = []
+    for y, truth, variance in ((y_a, x_b, v_b), (y_b, x_a, v_a)):
+        relative = variance.mean(-1) / scale
+        sums = np.zeros((n, n, -(-height // block), -(-width // block)))
+        count = np.zeros(sums.shape[2:])
+        for row in range(height):
+            for column in range(width):
+                near = relative[
+                    max(row - 4, 0) : row + 5, max(column - 4, 0) : column + 5
+                ].mean()
+                weight = 1 / (scale[row, column] * (1 + 10 * near))
+                error = y[:, row, column] - truth[row, column]
+                mean = error.mean(axis=0)
+                square = error[:, None] * error[None] - mean**2
+                at = row // block, column // block
+                sums[:, :, *at] += weight * square.mean(-1)
+                count[at] += 1
+        found.append(sums / count)
+    return found
+
+
+def test_blocks_and_weights_of_pixels_are_those_of_loops(rng):
+    """A frame of which the last blocks are cut off."""
+    truth = 1 + rng.random((11, 14, 3))
+    noisy = lambda size: jnp.asarray(truth + size * rng.normal(size=(2, 11, 14, 3)))
+    x, y = noisy(0.3), jnp.stack([noisy(0.1), 1.1 * noisy(0.1), noisy(0.2)])
+    v = jnp.asarray(0.09 * (0.5 + rng.random((2, 11, 14, 3))))
+    images = y[:, 0], y[:, 1], *x
+    a, b = by_loops(*map(np.asarray, (*images, *v)), block=4)
+    options = {"variance_a": v[0], "variance_b": v[1], "block": 4}
+    one = ensemble.error_matrix(*images, windows=(3,), whole_frame=False, **options)
+    # In excess of the plain average's, which does not change the weights.
+    np.testing.assert_allclose(one[..., 0], (a + b) / 2, rtol=1e-9)
+    count = np.outer([4, 4, 3], [4, 4, 4, 2])
+    whole = ensemble.error_matrix(*images, windows=(), **options)
+    mean = ((a + b) / 2 * count).sum((2, 3)) / count.sum()
+    np.testing.assert_allclose(whole[:, :, 1, 2, 0], mean, rtol=1e-9)
+    plain = ensemble.error_matrix(*images, windows=())
+    np.testing.assert_allclose(
+        ensemble.error_matrix(*images, windows=(), block=4)[:, :, 0, 0],
+        plain[:, :, 0, 0],
+        rtol=1e-9,
+    )
+
+
+def test_weights_of_blocks_are_smooth(truth):
+    """No seam between blocks, and near those of every pixel."""
+    images = rendering(jax.random.key(5), truth, 0.3)[1:]
+    solve = lambda block: ensemble.solve_weights(
+        *images, solver="multi-scale", windows=(13,), block=block
+    )
+    fine, coarse = solve(1), solve(4)
+    np.testing.assert_allclose(coarse.sum(axis=0), 1.0, rtol=1e-9)
+    assert float(coarse.min()) >= 0
+    steps = jnp.abs(jnp.diff(coarse, axis=2))
+    across = steps[:, :, 3::4].mean() / steps.mean()
+    assert 0.5 < float(across) < 2
+    assert float(jnp.abs(coarse - fine).mean()) < 0.1
+
+
+@pytest.mark.parametrize("where", ["the truth's half", "a base"])
+def test_fireflies_do_not_buy_weights(where):
+    """Neither one in x, which says nothing, nor one that a base lets through."""
+    keys = jax.random.split(jax.random.key(6), 2)
+    x = 1 + 0.2 * jax.random.normal(keys[0], (2, 48, 48, 3))
+    v = jnp.full_like(x, 0.04)
+    good = 1 + 0.02 * jax.random.normal(keys[1], (2, 48, 48, 3))
+    through = jnp.full_like(good, 1.02)
+    spots = [(5, 9), (20, 33), (41, 14), (30, 6)]
+    for row, column in spots:
+        if where == "a base":  # and in the half it was made from, with its variance
+            x = x.at[0, row, column].set(60.0)
+            v = v.at[0, row, column].set(900.0)
+            through = through.at[0, row, column].set(30.0)
+        else:
+            x = x.at[1, row, column].set(60.0)
+            v = v.at[1, row, column].set(900.0)
+    y = jnp.stack([good, through])
+    weights = ensemble.solve_weights(
+        *(y[:, 0], y[:, 1], *x),
+        solver="multi-scale",
+        variance_a=v[0],
+        variance_b=v[1],
+        windows=(29,),
+    )
+    near = jnp.stack([weights[:, row, column, 0] for row, column in spots])
+    # Both are equally wrong where there is no firefly: 0.02 squared.
+    if where == "a base":
+        assert float(near[:, 1].max()) < 0.05
+    else:
+        assert 0.2 < float(near.mean(axis=0)[0]) < 0.8
+
+
+def test_spread_is_a_weighted_variance(rng):
+    y, w = rng.random((3, 4, 5, 3)), rng.random((3, 4, 5, 3))
+    w /= w.sum(axis=0)
+    expected = (w * (y - (w * y).sum(axis=0)) ** 2).sum(axis=0)
+    found = ensemble.spread(jnp.asarray(y), jnp.asarray(w))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

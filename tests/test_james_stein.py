@@ -395,3 +395,84 @@ def test_rejects_bad_input():
         james_stein.risk(x, y, v, window=4)
     with pytest.raises(ValueError, match="not both"):
         james_stein.smooth_variance(v, sigma=1.0, weights=jnp.ones((6, 5, 225)))
+
+
+def bands_by_loops(x, y, v, sigmas, strength):
+    """Every kernel written out pixel by pixel, in float64."""
+    height, width, _ = x.shape
+    grey = y.mean(-1)
+    scale = np.sqrt(grey**2 + 0.01 * grey.mean() ** 2)[..., None]
+    r, noise = (x - y) / scale, (v / scale**2).mean(-1)
+    rows, columns = np.mgrid[:height, :width]
+
+    def kernel(row, column, sigma):
+        if sigma == 0:
+            return ((rows == row) & (columns == column)).astype(float)
+        reach = int(np.ceil(2.5 * sigma))
+        square = (rows - row) ** 2 + (columns - column) ** 2
+        inside = (abs(rows - row) <= reach) & (abs(columns - column) <= reach)
+        weights = inside * np.exp(-square / (2 * sigma**2))
+        return weights / weights.sum()
+
+    every = [0.0, *sigmas]
+    pixels = [(i, j) for i in range(height) for j in range(width)]
+    kernels = np.array([[kernel(i, j, s) for i, j in pixels] for s in every])
+    kernels = kernels.reshape(len(every), height, width, height, width)
+    result = y.copy()
+    for k, sigma in enumerate(every):
+        band = kernels[k] - (kernels[k + 1] if k + 1 < len(every) else 0)
+        d = np.einsum("ijkl,klc->ijc", band, r)
+        spread = np.einsum("ijkl,kl->ij", band**2, noise)
+        around = kernels[k] if sigma else kernels[-1]
+        power = np.einsum("ijkl,kl->ij", around, (d**2).mean(-1))
+        spread = np.einsum("ijkl,kl->ij", around, spread)
+        share = np.clip(1 - strength * spread / power, 0, 1)
+        result += scale * share[..., None] * d
+    return result
+
+
+def test_bands_are_those_of_loops(rng):
+    x, y = 1 + rng.random((2, 12, 13, 3))
+    v = 0.05 * rng.random((12, 13, 3))
+    made = james_stein.combine_bands(
+        *map(jnp.asarray, (x, y, v)), sigmas=(0.7, 1.6), strength=1.5
+    )
+    expected = bands_by_loops(x, y, v, (0.7, 1.6), 1.5)
+    np.testing.assert_allclose(made, expected, rtol=1e-9)
+    assert np.abs(made - y).max() > 0.1
+    assert np.abs(made - x).max() > 0.1
+
+
+def test_bands_have_their_limits(rng):
+    """Without noise x, with much y; texture that y lost comes back, noise does not."""
+    x, y = jnp.asarray(1 + rng.random((2, 24, 24, 3)))
+    nothing, much = jnp.zeros_like(x), jnp.full_like(x, 1e6)
+    np.testing.assert_allclose(james_stein.combine_bands(x, y, nothing), x, rtol=1e-9)
+    np.testing.assert_allclose(james_stein.combine_bands(x, y, much), y, rtol=1e-9)
+    stripes = 1 + 0.3 * (np.arange(64) // 2 % 2)[None, :, None]
+    truth = jnp.asarray(np.broadcast_to(stripes, (64, 64, 3)))
+    flat = jnp.full_like(truth, 1.15)
+    noise = jnp.asarray(0.1 * rng.normal(size=truth.shape))
+    variance = jnp.full_like(truth, 0.01)
+    error = lambda image, of: float(jnp.mean(jnp.square(image - of)))
+    refined = james_stein.combine_bands(truth + noise, flat, variance)
+    assert error(refined, truth) < 0.5 * error(flat, truth)
+    same = james_stein.combine_bands(flat + noise, flat, variance)
+    assert error(same, flat) < 0.05 * 0.01
+
+
+def test_bands_have_derivatives(rng):
+    x, y = jnp.asarray(1 + rng.random((2, 9, 9, 1)))
+    v = jnp.full_like(x, 0.01)
+    combine = lambda *i: james_stein.combine_bands(*map(jnp.asarray, i))
+    check_grads(combine, (x, y, v), order=1, modes=("fwd", "rev"))
+    slope = jax.grad(lambda *i: james_stein.combine_bands(*i).sum(), argnums=(0, 1, 2))
+    for images in ((x, x, v), (x, y, 0 * v), (0 * x, 0 * x, 0 * v)):
+        assert all(np.isfinite(g).all() for g in slope(*images))
+
+
+@pytest.mark.parametrize("sigmas", [(), (1.0, 1.0), (0.0,), (2.0, 1.0)])
+def test_bands_ascend(sigmas):
+    one = jnp.ones((3, 3, 1))
+    with pytest.raises(ValueError, match="sigmas must be positive and ascend"):
+        james_stein.combine_bands(one, one, one, sigmas=sigmas)

@@ -201,3 +201,27 @@ def test_flip_is_guarded(pair):
     with pytest.raises(ValueError, match="reference is all black"):
         metrics.hdr_flip(a, black)
     assert 0 <= metrics.flip(a, black) <= 1
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.1])
+def test_the_estimated_error_has_the_true_mean(bias):
+    """Of halves with noise of their own: over many frames, by its standard errors."""
+    size, noise, kept = 48, 0.2, 0.05
+    # Where the bases differ as much as they are wrong, as the map assumes.
+    shape = 0.5 + np.abs(np.sin(np.arange(size) / 5))[:, None, None]
+    spread = jnp.asarray(np.broadcast_to(bias**2 * shape**2, (size, size, 3)))
+
+    @jax.jit
+    def one(key):
+        x = 1 + noise * jax.random.normal(key, (2, size, size, 3))
+        z = 1 + bias * shape[None] + kept * (x - 1)  # follows its own noise
+        full = jnp.mean(z, axis=0)
+        weight = jnp.square(full.mean(-1, keepdims=True)) + 0.01
+        true = jnp.mean(jnp.square(full - 1) / weight)
+        found = metrics.estimate_error(full, z, x, spread)
+        return found.mean, true, found.standard_error
+
+    means, true, deviations = jax.vmap(one)(jax.random.split(jax.random.key(0), 64))
+    assert_mean(np.asarray(means - true), 0.0)
+    # Its own standard error is that of one frame.
+    assert 0.5 < float(means.std() / deviations.mean()) < 1.5

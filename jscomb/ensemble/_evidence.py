@@ -39,12 +39,12 @@ class Evidence(NamedTuple):
     Attributes:
         a: of <M>^a, mean over each block, [H/B,W/B,P*C] with P pairs; without unit.
         b: of <M>^b, same shape.
-        count: pixels of each block that are finite in all images, [H/B,W/B,1].
+        pixels: how many of each block are finite in all images, [H/B,W/B,1].
     """
 
     a: Packed
     b: Packed
-    count: Count
+    pixels: Count
 
 
 def evidence_of(

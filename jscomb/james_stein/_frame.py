@@ -123,6 +123,7 @@ def plan_bands(frame: Frame, estimate: Estimate) -> Local:
     """
     frame.require("james_stein.plan_bands", BANDS_NEEDS)
     first = plan_frame(frame, estimate)
+    assert first.halo is not None
     rule = compiled(combine_bands, epsilon=_EPSILON)
     refine = lambda i: rule(i[0], first.function(i), i[2])
     return first._replace(function=refine, halo=first.halo + reach_of_bands())

@@ -194,4 +194,5 @@ def _scaled(made: Combined, frame: Frame, whole: Frame) -> Combined:
     """The result in the frame's unit."""
     if frame.unit is not None:
         return made
+    assert whole.unit is not None
     return made._replace(estimate=made.estimate.scaled(whole.unit))
