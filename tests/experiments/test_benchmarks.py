@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.benchmarks import large, performance, robustness
+from experiments.benchmarks import large, performance, robustness, tiers
 from experiments.benchmarks.work import Work, work_of
 from jscomb import exr
+from tests.conftest import DATA
 
 M, N, K = 3, 5, 7
 
@@ -99,3 +100,15 @@ def test_robustness_counts_what_is_bad():
     said = robustness.report(found)
     assert said.answer.startswith("1 of 6 attempts end badly; 2 times")
     assert "| foreign |  |  |  | 1 |" in said.body
+
+
+@pytest.mark.slow
+def test_tiers_cost_what_their_parts_do():
+    frame = DATA / "cornell-glass-64.exr"
+    found, parts = tiers.run(tiers.Config(frame, quick=True))
+    ((size, tier), cost), *_ = found.items()
+    assert (size, tier) == (96, "fast")
+    assert 0 < cost.second < cost.first
+    assert parts[96].keys() >= {"oidn", "weights"}
+    said = tiers.report((found, parts))
+    assert f"fast {cost.second / cost.denoising:.3g}" in said.answer

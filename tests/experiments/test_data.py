@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.data import bundle, dataset, synthetic
+from experiments.data import bundle, dataset, development, synthetic
 from experiments.training import train
 from jscomb import exr, rendering
 from jscomb.denoisers import oidn
@@ -130,3 +130,25 @@ def test_a_dataset_is_made_once(tmp_path, vectorised, capsys):
         "random-00002",
         "random-00003",
     }
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not rendering.available(), reason="needs Mitsuba")
+def test_development_frames_are_rendered_once(tmp_path, monkeypatch):
+    config = development.Config(tmp_path / "out", scenes=tmp_path, quick=True)
+    (path,) = development.run(config)
+    before = path.stat().st_mtime_ns
+    assert development.run(config) == [path]
+    assert path.stat().st_mtime_ns == before
+    assert list(development.frames(config.out)) == [("cornell-glossy", 16, path)]
+    frame = exr.read_frame(path)
+    assert (frame.sub_buffers, float(frame.samples)) == (4, 16)
+    r, noise = frame.normalised().reference
+    weight = np.square(r) + 0.01
+    expected = np.mean(np.square(noise) / 4 / weight)
+    assert development.noise(path) == pytest.approx(float(expected), rel=1e-4)
+    missing = dataclasses.replace(config, quick=False)
+    with pytest.raises(ValueError, match=r"veach-mis/scene\.xml: no such file"):
+        development.run(missing)
+    with pytest.raises(ValueError, match="no frames there"):
+        list(development.frames(tmp_path))
