@@ -13,8 +13,9 @@ of them), so the answer is of the others; all frames are in the tables.
                weights of pixels, with weights of one window.
     estimate   the estimated error beside the true one: the factor between both, and
                the rank correlation of the map with the true error over 8x8 blocks.
-    halves     the estimated change of relative L2 against `oidn` from halves, beside
-               the true one: slope, correlation and share of wrong signs.
+    changes    the change of the halves' error against `oidn`, estimated from the other
+               half, beside the true one: slope, rank correlation and share of wrong
+               signs; and the same with noisy pixels weighted less.
 """
 
 import dataclasses
@@ -137,16 +138,43 @@ def measure(frame: Frame, *, quick: bool) -> dict[str, float]:
         names = [*names, *ALSO]
     frame = with_inputs(key, frame, names)
     row |= {name: error(frame.estimates[name].image) for name in names}
-    x = jnp.stack([half.color for half in frame.halves()])
-    y = frame.estimates["oidn"]
-    for name in names:
-        z = frame.estimates[name]
-        if name != "oidn" and z.halves is not None:
-            change = metrics.rel_l2_change(z.halves, y.halves, x)
-            row[f"{name} change"] = float(change.mean)
     if not quick:
         best, _ = inputs(frame, biased=[*TIERS["best"].bases])
         row |= ablation(frame, {name: frame.estimates[name] for name in best})
+    return row
+
+
+def changes(frame: Frame, *, quick: bool) -> dict[str, float]:
+    """Changes of the halves' errors against `oidn`, relative to its error.
+
+    The true one, that estimated from the other half as it is, and with noisy pixels
+    weighted less, as the ensemble's weights see it.
+    """
+    assert frame.reference is not None
+    tier = TIERS["balanced" if quick else "best"]
+    names, _ = inputs(frame, biased=[*tier.bases, *(() if quick else ("njs", "dsc"))])
+    frame = with_inputs(jax.random.key(0), frame, names)
+    a, b = frame.halves()
+    x, y = jnp.stack([a.color, b.color]), frame.estimates["oidn"].halves
+    r, noise = frame.reference
+    error = lambda halves: float(
+        np.mean([metrics.rel_l2(i, r, half_difference=noise) for i in halves])
+    )
+    of = compiled(ensemble.error_matrix, windows=())
+    before, row = error(y), {}
+    for name in names:
+        z = frame.estimates[name].halves
+        if name == "oidn" or z is None:
+            continue
+        pair = jnp.stack([z, y])
+        images = pair[:, 0], pair[:, 1], *x
+        matrix = of(*images, variance_a=a.variance, variance_b=b.variance)
+        weighted = matrix[0, 0, 0, 0, 0] - matrix[1, 1, 0, 0, 0]
+        row |= {
+            f"{name} true": (error(z) - before) / before,
+            f"{name} plain": float(metrics.rel_l2_change(z, y, x).mean) / before,
+            f"{name} weighted": float(weighted) / before,
+        }
     return row
 
 
@@ -165,12 +193,16 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     kept, found = Results(config.results), {}
     every = list(development.frames(config.folder))[: 1 if config.quick else None]
     for scene, samples, path in tqdm(every, unit="frame"):
-
-        def one(path: pathlib.Path = path) -> dict[str, float]:
-            return measure(exr.read_frame(path).normalised(), quick=config.quick)
-
-        found[f"{scene} {samples}"] = kept.get(f"{scene} {samples}", one)
+        name, read = f"{scene} {samples}", functools.partial(_read, path)
+        row = kept.get(name, lambda r=read: measure(r(), quick=config.quick))
+        also = lambda r=read: changes(r(), quick=config.quick)
+        found[name] = row | kept.get(f"{name} changes", also)
     return found
+
+
+def _read(path: pathlib.Path) -> Frame:
+    """A normalised frame."""
+    return exr.read_frame(path).normalised()
 
 
 def report(found: dict[str, dict[str, float]]) -> Report:
@@ -200,6 +232,7 @@ def report(found: dict[str, dict[str, float]]) -> Report:
         or n in ("pixels of equal weight", "equal weights")
         or n.startswith("one window")
     ]
+    least = lambda row, tier: min(row[n] for n in TIERS[tier].bases if n in row)
     worst = lambda name: max(r[name] / better(r) for r in unseen.values())
     said = [
         f"{tier} {mean(unseen, tier, better):.2f} (worst {worst(tier):.2f}; over "
@@ -218,6 +251,13 @@ def report(found: dict[str, dict[str, float]]) -> Report:
         errors.means(unseen, tiers, by_setting, title="tier"),
         "All scenes, over the better of path tracing and OIDN:",
         title(found, better),
+        "The same over the member of the tier of least true error (regret):",
+        errors.means(
+            {n: {t: r[t] / least(r, t) for t in tiers} for n, r in found.items()},
+            tiers,
+            lambda row: 1.0,
+            title="tier",
+        ),
         table(
             ["frame", *tiers, "the best single method"],
             [
@@ -264,16 +304,22 @@ def _changes(found: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
     """How estimated changes against `oidn` go with the true ones."""
     rows = []
     for name in names:
-        some = [r for r in found.values() if f"{name} change" in r]
+        some = [r for r in found.values() if f"{name} true" in r]
         if len(some) < 2:
             continue
-        # Relative, or the frames of few samples would decide.
-        said = np.array([r[f"{name} change"] / r["oidn"] for r in some])
-        true = np.array([(r[name] - r["oidn"]) / r["oidn"] for r in some])
-        slope = float(np.sum(said * true) / np.sum(true**2))
-        wrong = float(np.mean(np.sign(said) != np.sign(true)))
-        rows.append([name, slope, float(np.corrcoef(said, true)[0, 1]), wrong])
-    return table(["change against oidn", "slope", "correlation", "wrong signs"], rows)
+        true, plain, weighted = (
+            np.array([r[f"{name} {kind}"] for r in some])
+            for kind in ("true", "plain", "weighted")
+        )
+        slope = float(np.sum(plain * true) / np.sum(true**2))
+        ranks = [np.argsort(np.argsort(i)) for i in (true, plain, weighted)]
+        row = [name, slope]
+        for said, rank in ((plain, ranks[1]), (weighted, ranks[2])):
+            row.append(float(np.corrcoef(ranks[0], rank)[0, 1]))
+            row.append(float(np.mean(np.sign(said) != np.sign(true))))
+        rows.append(row)
+    header = ["change against oidn", "slope", "rank correlation", "wrong signs"]
+    return table([*header, "weighted: rank correlation", "wrong signs"], rows)
 
 
 if __name__ == "__main__":

@@ -133,18 +133,17 @@ def combine_tier(
 
 def _within(frame: Frame, tier: str | None, budget: float | None) -> tuple[str, str]:
     """The tier, and why it is not the one that was asked for or the best."""
-    *_, best = TIERS
-    if tier is not None and tier not in TIERS:
-        raise ValueError(f"no tier {tier!r}; there are {', '.join(TIERS)}")
-    tier = tier or best
+    order = [*TIERS]
+    tier = tier or order[-1]
+    if tier not in order:
+        raise ValueError(f"no tier {tier!r}; there are {', '.join(order)}")
     if budget is None or oidn.NEEDS.missing(frame):
         return tier, ""
     seconds = _seconds(frame)
-    affordable = [t for t in TIERS if TIERS[t].denoisings * seconds <= budget]
-    cheapest, *_ = TIERS
-    order = list(TIERS)
-    chosen = min(affordable[-1:] or [cheapest], key=order.index)
-    if order.index(chosen) >= order.index(tier):
+    cheapest, *others = order[: order.index(tier) + 1]
+    affordable = [t for t in others if TIERS[t].denoisings * seconds <= budget]
+    chosen = affordable[-1] if affordable else cheapest
+    if chosen == tier:
         return tier, ""
     expected = TIERS[tier].denoisings * seconds
     return chosen, f"{tier} takes about {expected:.2g} s of {budget:.2g}"
