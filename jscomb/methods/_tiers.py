@@ -38,7 +38,7 @@ TIERS: dict[str, Tier] = {
     "balanced": Tier(
         "ensemble of a few denoisers",
         ("oidn", "oidn-color", "nonlocal-means", "multi-scale", "path-tracing"),
-        10.0,
+        11.0,
     ),
     "best": Tier(
         "ensemble of everything that lowers the error",
@@ -47,7 +47,7 @@ TIERS: dict[str, Tier] = {
             *("bilateral", "rdfc", "nonlocal-means"),
             *("multi-scale", "double-shrinkage", "path-tracing"),
         ),
-        50.0,
+        70.0,
     ),
 }
 """By name, the cheapest first."""
