@@ -111,8 +111,8 @@ def combine_tier(
         >>> frame = make_frame(x, estimates={"y": Estimate(y[0], y)})
         >>> names = ["y", "path-tracing"]
         >>> made = combine_tier(jax.random.key(0), frame, tier="best", biased=names)
-        >>> print(made.bases, f"{made.error.mean:.4f}")
-        ('y', 'path-tracing') 0.0019
+        >>> print(made.bases, f"{made.error.mean:.3f}")
+        ('y', 'path-tracing') 0.002
     """
     whole = frame.normalised()
     tier, reason = _within(whole, tier, budget)

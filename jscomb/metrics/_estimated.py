@@ -74,8 +74,9 @@ def estimate_error(
         >>> x = 1 + 0.1 * jax.random.normal(jax.random.key(0), (2, 64, 64, 3))
         >>> z = jnp.full((2, 64, 64, 3), 1.1)  # a tenth too bright
         >>> found = estimate_error(z[0], z, x, jnp.full_like(z[0], 1e-4))
-        >>> print(f"{found.mean:.4f} of {0.01 / 1.22:.4f}")
-        0.0082 of 0.0082
+        >>> true = 0.01 / (1.1**2 + 0.01)
+        >>> print(abs(found.mean / true - 1) < 0.1)
+        True
 
     Source: ours.
     """
