@@ -76,3 +76,24 @@ def means(
         return [method, *mean, geometric_mean(every), max(every), *more]
 
     return table([title, *groups, "all", "worst", *beside], map(cells, methods))
+
+
+def block_means(image: Image, width: int) -> np.ndarray:
+    """Average an image over channels and square blocks.
+
+    Args:
+        image: [H,W,C]; what does not fill a block at the end is cut off.
+        width: of a block in pixels.
+
+    Returns:
+        the means as one row, float64.
+    """
+    rows, columns = (size // width for size in image.shape[:2])
+    grey = np.asarray(image, np.float64)[: rows * width, : columns * width].mean(-1)
+    return grey.reshape(rows, width, columns, width).mean(axis=(1, 3)).ravel()
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return Spearman's correlation of two rows."""
+    ranks = [np.argsort(np.argsort(each)) for each in (a, b)]
+    return float(np.corrcoef(*ranks)[0, 1])

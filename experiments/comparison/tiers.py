@@ -101,21 +101,12 @@ def judged(frame: Frame, made: Estimate, found: metrics.ErrorEstimate) -> dict:
     square = jnp.square(made.image - r)
     if noise is not None:
         square = square - jnp.square(noise) / 4
-    maps = [_blocks(i) for i in (square / weight, found.map)]
-    ranks = [np.argsort(np.argsort(each)) for each in maps]
+    maps = (errors.block_means(i, BLOCK) for i in (square / weight, found.map))
     return {
         "estimated": float(found.mean) / true,
         "standard error": float(found.standard_error) / true,
-        "map": float(np.corrcoef(*ranks)[0, 1]),
+        "map": errors.rank_correlation(*maps),
     }
-
-
-def _blocks(image: Image) -> np.ndarray:
-    """Mean over channels and blocks, as one row."""
-    height, width = (size // BLOCK * BLOCK for size in image.shape[:2])
-    grey = np.asarray(image, np.float64)[:height, :width].mean(axis=-1)
-    parts = grey.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    return parts.mean(axis=(1, 3)).ravel()
 
 
 def measure(frame: Frame, *, quick: bool) -> dict[str, float]:
@@ -312,10 +303,9 @@ def _changes(found: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
             for kind in ("true", "plain", "weighted")
         )
         slope = float(np.sum(plain * true) / np.sum(true**2))
-        ranks = [np.argsort(np.argsort(i)) for i in (true, plain, weighted)]
         row = [name, slope]
-        for said, rank in ((plain, ranks[1]), (weighted, ranks[2])):
-            row.append(float(np.corrcoef(ranks[0], rank)[0, 1]))
+        for said in (plain, weighted):
+            row.append(errors.rank_correlation(true, said))
             row.append(float(np.mean(np.sign(said) != np.sign(true))))
         rows.append(row)
     header = ["change against oidn", "slope", "rank correlation", "wrong signs"]

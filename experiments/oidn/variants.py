@@ -30,7 +30,6 @@ from jscomb import ensemble, methods
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
 from jscomb.numerics import sure
-from jscomb.typing import Image
 
 FEATURES = "oidn", "oidn-albedo", "oidn-color", "oidn-demodulated"
 CLEAN = "oidn-clean", "oidn-clean-balanced"
@@ -65,20 +64,6 @@ class Config(Options):
     results: pathlib.Path | None = None
 
 
-def blocks(image: Image) -> np.ndarray:
-    """Mean over channels and blocks, as one row."""
-    height, width = (size // BLOCK * BLOCK for size in image.shape[:2])
-    grey = np.asarray(image, np.float64)[:height, :width].mean(axis=-1)
-    parts = grey.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    return parts.mean(axis=(1, 3)).ravel()
-
-
-def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's."""
-    ranks = [np.argsort(np.argsort(each)) for each in (a, b)]
-    return float(np.corrcoef(*ranks)[0, 1])
-
-
 def maps(frame: Frame, family: dict) -> dict[str, float]:
     """Rank correlations with the true error, by map."""
     assert frame.reference is not None
@@ -98,8 +83,9 @@ def maps(frame: Frame, family: dict) -> dict[str, float]:
         "SURE": risk.squared_error,
         "halves": sum(crossed) / 2,
     }
-    truth = blocks(jnp.square(y - frame.reference.image))
-    return {name: rank_correlation(blocks(found[name]), truth) for name in MAPS}
+    means = lambda image: errors.block_means(image, BLOCK)
+    truth = means(jnp.square(y - frame.reference.image))
+    return {n: errors.rank_correlation(means(found[n]), truth) for n in MAPS}
 
 
 def measure(frame: Frame, titles: Iterable[str]) -> dict[str, float]:

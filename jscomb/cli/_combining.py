@@ -54,8 +54,8 @@ def combine(
         out: EXR file to write; for several frames, or if such a folder exists, the
             folder.
         biased: EXR file of the biased image, its name within the frame, or a denoiser
-            of the methods. By default the frame's only one; a frame without any is
-            denoised by Open Image Denoise.
+            of the methods. By default a tier makes its own, and adds those of the
+            frame; a method takes the frame's only one, or Open Image Denoise.
         method: a tier, one of the methods, or auto: the best tier within the budget, an
             ensemble whose weights the half buffers tell; for a frame without them the
             tier fast.

@@ -74,7 +74,7 @@ def combine_bands(
         [2.97]
         [1.]
 
-    Source: ours, after NJS eq. 5; the constants were set on five path-traced scenes.
+    Source: ours, after NJS eq. 5; the constants were set on path-traced frames.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance)
     if not sigmas or min(np.diff([0.0, *sigmas])) <= 0:

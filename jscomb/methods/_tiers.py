@@ -41,7 +41,7 @@ TIERS: dict[str, Tier] = {
         11.0,
     ),
     "best": Tier(
-        "ensemble of everything that lowers the error",
+        "ensemble of many denoisers and combiners",
         (
             *("oidn", "oidn-color", "oidn-demodulated", "oidn-clean", "pd"),
             *("bilateral", "rdfc", "nonlocal-means"),
