@@ -9,6 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import james_stein
+from jscomb.frame import Estimate, make_frame
 from jscomb.numerics import sure
 from tests.statistics import assert_mean, assert_mean_below
 from tests.test_windows import near
@@ -469,6 +470,22 @@ def test_bands_have_derivatives(rng):
     slope = jax.grad(lambda *i: james_stein.combine_bands(*i).sum(), argnums=(0, 1, 2))
     for images in ((x, x, v), (x, y, 0 * v), (0 * x, 0 * x, 0 * v)):
         assert all(np.isfinite(g).all() for g in slope(*images))
+
+
+def test_few_samples_shrink_more(rng):
+    """The strength of a frame's bands is 2 + 12 / samples."""
+    x, y = 1 + rng.random((2, 24, 24, 3))
+    made = {}
+    for samples, strength in ((4, 5.0), (None, 2.0)):
+        frame = make_frame(x, samples=samples, variance=np.full(x.shape, 0.1))
+        frame, flat = frame.normalised(1.0), Estimate(jnp.asarray(y))
+        first = james_stein.combine_frame(frame, flat).image
+        made[samples] = james_stein.plan_bands(frame, flat).whole()
+        expected = james_stein.combine_bands(
+            frame.color, first, frame.variance, epsilon=0.01, strength=strength
+        )
+        np.testing.assert_allclose(made[samples], expected, rtol=1e-12)
+    assert jnp.abs(made[4] - made[None]).max() > 1e-3
 
 
 @pytest.mark.parametrize("sigmas", [(), (1.0, 1.0), (0.0,), (2.0, 1.0)])

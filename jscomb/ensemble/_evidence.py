@@ -1,11 +1,11 @@
 """What one half of a frame says of bases made from the other."""
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import (
@@ -16,7 +16,7 @@ from jscomb.numerics.guards import (
     zero_invalid,
 )
 from jscomb.numerics.medians import median_of
-from jscomb.numerics.windows import window_mean, window_sum
+from jscomb.numerics.windows import block_sum, window_mean, window_sum
 from jscomb.typing import Image, Mask, Variance
 
 Bases = Float[Array, "n h w c"]
@@ -69,16 +69,22 @@ def evidence_of(
     typical = (median_of(y_a) + median_of(y_b)) / 2
     bright = jnp.mean(typical, axis=-1, keepdims=True)
     scale = jnp.square(bright) + _FLOOR * jnp.square(masked_mean(bright, valid))
-    count = _blocks(valid.astype(scale.dtype), block)
+    count = block_sum(valid.astype(scale.dtype), block)
 
     def one(y: Bases, truth: Image, variance: Variance | None) -> Packed:
         weight = _weight(scale, variance, valid)
         mean = jnp.mean(y, axis=0)
-        e = y - mean[None]
-        both = e[rows] * e[columns] + (e[rows] + e[columns]) * (mean - truth)[None]
-        if shared:
-            both = jnp.mean(both, axis=-1, keepdims=True)
-        sums = jax.vmap(functools.partial(_blocks, block=block))(weight[None] * both)
+        e, excess = y - mean[None], mean - truth
+
+        @jax.checkpoint  # or the images of every pair are kept for derivatives
+        def element(pair: tuple[Array, Array]) -> Packed:
+            e_i, e_j = e[pair[0]], e[pair[1]]
+            both = e_i * e_j + (e_i + e_j) * excess
+            if shared:
+                both = jnp.mean(both, axis=-1, keepdims=True)
+            return block_sum(weight * both, block)
+
+        sums = lax.map(element, (rows, columns))  # no pair's images at once
         packed = jnp.moveaxis(sums, 0, 2).reshape(*count.shape[:2], -1)
         return weighted_ratio(packed, count)
 
@@ -103,18 +109,6 @@ def _weight(
         near = window_mean(relative, _NOISE_WINDOW, mask=valid)
         square = scale * (1 + _NOISE * near)
     return divide(jnp.ones_like(square), square, where=valid & (square > 0))
-
-
-def _blocks(image: Image, block: int) -> Packed:
-    """Sums over blocks, the last of a row or column as large as it is."""
-    height, width, channels = image.shape
-    if block == 1:
-        return image
-    below, right = -height % block, -width % block
-    padded = jnp.pad(image, ((0, below), (0, right), (0, 0)))
-    rows, columns = (height + below) // block, (width + right) // block
-    split = padded.reshape(rows, block, columns, block, channels)
-    return jnp.sum(split, axis=(1, 3))
 
 
 def pooled(values: Packed, count: Count, window: int | None) -> Packed:

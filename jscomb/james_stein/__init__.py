@@ -45,7 +45,11 @@ Sources:
     normal distribution", 1964 (the positive part).
 """
 
-from jscomb.james_stein._bands import combine_bands, reach_of_bands
+from jscomb.james_stein._bands import (
+    combine_bands,
+    reach_of_bands,
+    strength_for,
+)
 from jscomb.james_stein._combine import combine, combine_dual, reach
 from jscomb.james_stein._estimate import guide_noise, risk, worth_regressing
 from jscomb.james_stein._frame import (
@@ -94,5 +98,6 @@ __all__ = [
     "risk",
     "robust_variance",
     "smooth_variance",
+    "strength_for",
     "worth_regressing",
 ]

@@ -28,11 +28,12 @@ from jscomb.numerics.guards import (
     weighted_ratio,
     zero_invalid,
 )
-from jscomb.numerics.windows import reach_of, separable_sum
+from jscomb.numerics.windows import gaussian_kernel, reach_of, separable_sum
 from jscomb.typing import Image, Scalar, Variance
 
 SIGMAS = 0.7, 1.0, 1.4, 2.0
 STRENGTH = 2.0
+_FEW = 12.0  # samples whose variance is so noisy that the strength rises by one
 
 
 def combine_bands(
@@ -41,7 +42,7 @@ def combine_bands(
     variance: Variance,
     *,
     sigmas: Sequence[float] = SIGMAS,
-    strength: float = STRENGTH,
+    strength: Scalar | float = STRENGTH,
     epsilon: Scalar | float | None = None,
 ) -> Image:
     """Shrink `unbiased` towards `biased` in bands of spatial scale.
@@ -55,7 +56,7 @@ def combine_bands(
         variance: of the mean x, squared radiance, shape [H,W,C].
         sigmas: standard deviations in pixels of the filters G_k, ascending.
         strength: t; more than 1 because y follows x, and because the share of a few
-            pixels is itself noisy.
+            pixels is itself noisy. See `strength_for`.
         epsilon: squared radiance added to that of a pixel, which limits the weight of
             black ones; None for a hundredth of the squared mean of y.
 
@@ -107,7 +108,7 @@ def combine_bands(
         total = separable_sum(noise, kernels[i] * inner)
         return weighted_ratio(total, mass[i] * mass[j])
 
-    kept = jnp.zeros_like(difference)
+    t, kept = jnp.asarray(strength, x.dtype), jnp.zeros_like(difference)
     for k, kernel in enumerate(around):
         band, spread = filtered[k], covariance(k, k)
         if k + 1 < len(kernels):
@@ -116,8 +117,27 @@ def combine_bands(
         power = jnp.mean(jnp.square(band), axis=-1, keepdims=True)
         power, spread = (separable_sum(i * ones, kernel) for i in (power, spread))
         ratio = divide(spread, power, where=power > 0, otherwise=1.0)
-        kept += jnp.clip(1 - strength * ratio, 0.0, 1.0) * band
+        kept += jnp.clip(1 - t * ratio, 0.0, 1.0) * band
     return jnp.where(valid, y + scale * kept, first_finite(biased, unbiased))
+
+
+def strength_for(samples: Scalar | float | None) -> Scalar | float:
+    """Return the strength of `combine_bands` for a number of samples.
+
+    The fewer the samples, the noisier is their variance, and the more often it is too
+    small where no sample found the light.
+
+    Args:
+        samples: a pixel; None if unknown.
+
+    Returns:
+        t, 2 for many samples.
+
+    Example:
+        >>> print(strength_for(16), strength_for(None))
+        2.75 2.0
+    """
+    return STRENGTH if samples is None else STRENGTH + _FEW / samples
 
 
 def reach_of_bands(*, sigmas: Sequence[float] = SIGMAS) -> int:
@@ -138,7 +158,5 @@ def reach_of_bands(*, sigmas: Sequence[float] = SIGMAS) -> int:
 
 
 def _gaussian(sigma: float) -> np.ndarray:
-    """Weights along one axis, of sum one."""
-    reach = int(np.ceil(2.5 * sigma))
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return weights / weights.sum()
+    """Weights along one axis, cut off where they hardly matter."""
+    return gaussian_kernel(2 * int(np.ceil(2.5 * sigma)) + 1, sigma)

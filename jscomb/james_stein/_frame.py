@@ -9,7 +9,7 @@ import numpy as np
 
 from jscomb.features import select, stack
 from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
-from jscomb.james_stein._bands import combine_bands, reach_of_bands
+from jscomb.james_stein._bands import combine_bands, reach_of_bands, strength_for
 from jscomb.james_stein._combine import combine, reach
 from jscomb.james_stein._estimate import COARSE, worth_regressing
 from jscomb.james_stein._neural import KERNEL, Network, combine_inputs
@@ -125,7 +125,8 @@ def plan_bands(frame: Frame, estimate: Estimate) -> Local:
     first = plan_frame(frame, estimate)
     assert first.halo is not None
     rule = compiled(combine_bands, epsilon=_EPSILON)
-    refine = lambda i: rule(i[0], first.function(i), i[2])
+    strength = strength_for(frame.samples)
+    refine = lambda i: rule(i[0], first.function(i), i[2], strength=strength)
     return first._replace(function=refine, halo=first.halo + reach_of_bands())
 
 

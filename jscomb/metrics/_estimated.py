@@ -12,7 +12,7 @@ from jscomb.numerics.guards import (
     safe_sqrt,
     zero_invalid,
 )
-from jscomb.numerics.windows import window_mean
+from jscomb.numerics.windows import block_sum, window_mean
 from jscomb.typing import Image, Scalar
 
 _WINDOW, _SIGMA = 19, 3.0  # of the maps, in pixels
@@ -102,15 +102,7 @@ def estimate_error(
     one = lambda a, b: divide(a[None], b[None], where=b[None] > 0)[0]
     factor = one(jnp.sum(trust * error), total)
     residual = jnp.where(valid, trust * (error - factor * shape), 0.0)
-    deviation = safe_sqrt(jnp.sum(jnp.square(_blocks(residual))))
+    deviation = safe_sqrt(jnp.sum(jnp.square(block_sum(residual, _BLOCK))))
     return ErrorEstimate(
         jnp.maximum(factor, 0.0) * shape, factor * level, one(deviation, total) * level
     )
-
-
-def _blocks(image: Float[Array, "h w 1"]) -> Array:
-    """Sums over blocks."""
-    below, right = (-size % _BLOCK for size in image.shape[:2])
-    padded = jnp.pad(image[..., 0], ((0, below), (0, right)))
-    rows, columns = (size // _BLOCK for size in padded.shape)
-    return jnp.sum(padded.reshape(rows, _BLOCK, columns, _BLOCK), axis=(1, 3))

@@ -30,7 +30,9 @@ from jscomb.typing import Image, Mask
 
 __all__ = [
     "at_window_max",
+    "block_sum",
     "check_window",
+    "gaussian_kernel",
     "reach_of",
     "separable_sum",
     "window_count",
@@ -92,9 +94,58 @@ def window_mean(
     if sigma is None:
         total, weight = window_sum(image, window), window_sum(ones, window)
     else:
-        kernel = _gaussian(window, sigma)
+        kernel = gaussian_kernel(window, sigma)
         total, weight = (separable_sum(i, kernel) for i in (image, ones))
     return weighted_ratio(total, weight)
+
+
+def gaussian_kernel(window: int, sigma: float) -> np.ndarray:
+    """Return Gaussian weights along one axis, for `separable_sum`.
+
+    Args:
+        window: their number, odd.
+        sigma: standard deviation in pixels.
+
+    Returns:
+        the weights, of sum one, shape [w].
+
+    Raises:
+        ValueError: if `window` is even or `sigma` not positive.
+
+    Example:
+        >>> print(gaussian_kernel(3, 1.0).round(3))
+        [0.274 0.452 0.274]
+    """
+    r = check_window(window) // 2
+    if not sigma > 0:
+        raise ValueError(f"sigma must be positive, got {sigma}")
+    weights = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
+    return weights / weights.sum()
+
+
+def block_sum(image: Image, block: int) -> Float[Array, "rows columns _"]:
+    """Return the sums over square blocks.
+
+    Args:
+        image: shape [H,W,C].
+        block: width B of a block in pixels.
+
+    Returns:
+        the sums, shape [H/B,W/B,C], rounded up: the last block of a row or column has
+        the pixels that are left.
+
+    Example:
+        >>> print(block_sum(jnp.ones((2, 5, 1)), 2)[..., 0])
+        [[4. 4. 2.]]
+    """
+    if block == 1:
+        return image
+    height, width, channels = image.shape
+    below, right = -height % block, -width % block
+    padded = jnp.pad(image, ((0, below), (0, right), (0, 0)))
+    rows, columns = (height + below) // block, (width + right) // block
+    split = padded.reshape(rows, block, columns, block, channels)
+    return jnp.sum(split, axis=(1, 3))
 
 
 def window_min(image: Image, window: int, *, mask: Mask | None = None) -> Image:
@@ -345,12 +396,3 @@ def _extremum(image: Image, window: int, pick: Callable, neutral: float) -> Imag
             run, span = pick(near, far), span + step
         image = run
     return image
-
-
-def _gaussian(window: int, sigma: float) -> np.ndarray:
-    """Return Gaussian weights along one axis, which sum to one."""
-    r = check_window(window) // 2
-    if not sigma > 0:
-        raise ValueError(f"sigma must be positive, got {sigma}")
-    weights = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
-    return weights / weights.sum()

@@ -30,6 +30,7 @@ ELSEWHERE = {
         "james_stein.reach",
         "james_stein.reach_of_bands",
         "james_stein.regress",
+        "james_stein.strength_for",
         "james_stein.worth_regressing",
         "kernel_predicting.denoise_inputs",
         "kernel_predicting.neural_inputs",
