@@ -21,13 +21,14 @@ sight than those that `UNSEEN` names, of which the answer is; the tables have al
 import dataclasses
 import functools
 import pathlib
-import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from experiments.common import errors
@@ -111,40 +112,36 @@ def judged(frame: Frame, made: Estimate, found: metrics.ErrorEstimate) -> dict:
 
 def measure(frame: Frame, *, quick: bool) -> dict[str, float]:
     """Everything of one normalised frame."""
+    assert frame.reference is not None
     key, error = jax.random.key(0), functools.partial(errors.relative_l2, frame=frame)
-    row = {"path tracing": error(frame.color)}
-    for tier in [*TIERS][: 2 if quick else None]:
-        start = time.perf_counter()
+    flip = lambda image: metrics.flip(image, frame.reference.image)
+    row = {"path tracing": error(frame.color), "path tracing FLIP": flip(frame.color)}
+    tiers = [*TIERS][: 2 if quick else None]
+    for tier in tiers:
         made = combine_tier(key, frame, tier=tier)
-        jax.block_until_ready(made.estimate.image)
-        row |= {
-            tier: error(made.estimate.image),
-            f"{tier} s": time.perf_counter() - start,
-        }
+        image = made.estimate.image
+        row |= {tier: error(image), f"{tier} FLIP": flip(image)}
         if made.error is not None:
             of = judged(frame, made.estimate, made.error)
             row |= {f"{tier} {name}": value for name, value in of.items()}
-    names, _ = inputs(frame, biased=[*TIERS["balanced" if quick else "best"].bases])
-    if not quick:
-        names = [*names, *ALSO]
+    members = [*TIERS[tiers[-1]].bases]
+    names, _ = inputs(frame, biased=[*members, *(() if quick else ALSO)])
     frame = with_inputs(key, frame, names)
     row |= {name: error(frame.estimates[name].image) for name in names}
+    row |= {"oidn FLIP": flip(frame.estimates["oidn"].image)}
+    row |= changes(frame, names)
     if not quick:
-        best, _ = inputs(frame, biased=[*TIERS["best"].bases])
-        row |= ablation(frame, {name: frame.estimates[name] for name in best})
+        row |= ablation(frame, {n: frame.estimates[n] for n in names if n in members})
     return row
 
 
-def changes(frame: Frame, *, quick: bool) -> dict[str, float]:
+def changes(frame: Frame, names: Sequence[str]) -> dict[str, float]:
     """Changes of the halves' errors against `oidn`, relative to its error.
 
     The true one, that estimated from the other half as it is, and with noisy pixels
     weighted less, as the ensemble's weights see it.
     """
     assert frame.reference is not None
-    tier = TIERS["balanced" if quick else "best"]
-    names, _ = inputs(frame, biased=[*tier.bases, *(() if quick else ("njs", "dsc"))])
-    frame = with_inputs(jax.random.key(0), frame, names)
     a, b = frame.halves()
     x, y = jnp.stack([a.color, b.color]), frame.estimates["oidn"].halves
     r, noise = frame.reference
@@ -184,10 +181,9 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     kept, found = Results(config.results), {}
     every = list(development.frames(config.folder))[: 1 if config.quick else None]
     for scene, samples, path in tqdm(every, unit="frame"):
-        name, read = f"{scene} {samples}", functools.partial(_read, path)
-        row = kept.get(name, lambda r=read: measure(r(), quick=config.quick))
-        also = lambda r=read: changes(r(), quick=config.quick)
-        found[name] = row | kept.get(f"{name} changes", also)
+        name = f"{scene} {samples}"
+        of = lambda p=path: measure(_read(p), quick=config.quick)
+        found[name] = kept.get(name, of)
     return found
 
 
@@ -223,6 +219,7 @@ def report(found: dict[str, dict[str, float]]) -> Report:
         or n in ("pixels of equal weight", "equal weights")
         or n.startswith("one window")
     ]
+    shown = ["path tracing", "oidn", *tiers]
     least = lambda row, tier: min(row[n] for n in TIERS[tier].bases if n in row)
     worst = lambda name: max(r[name] / better(r) for r in unseen.values())
     said = [
@@ -264,9 +261,38 @@ def report(found: dict[str, dict[str, float]]) -> Report:
             "`best` with less, over `best`:",
             errors.means(complete, parts, of_best, title="ablation"),
         ]
-    body.append(_estimates(found, tiers))
-    body.append(_changes(found, alone))
-    return Report(answer, "\n\n".join(body))
+    body += [
+        "FLIP (tone mapped), over that of `oidn`:",
+        errors.means(
+            {n: {t: r[f"{t} FLIP"] for t in shown} for n, r in found.items()},
+            shown,
+            lambda row: row["oidn"],
+            title="image",
+        ),
+        _estimates(found, tiers),
+        _changes(found, alone),
+    ]
+    plot = {"The estimated error beside the true one": estimates_plot(found, tiers)}
+    return Report(answer, "\n\n".join(body), plot)
+
+
+def estimates_plot(found: Mapping[str, errors.Row], tiers: Sequence[str]) -> Figure:
+    """Draw every frame's estimated relative L2 against its true one."""
+    figure, axes = plt.subplots(figsize=(5, 5))
+    limits = [np.inf, 0.0]
+    for tier in tiers:
+        some = [r for r in found.values() if f"{tier} estimated" in r]
+        if not some:
+            continue
+        true = np.array([r[tier] for r in some])
+        said = true * [r[f"{tier} estimated"] for r in some]
+        spread = true * [r[f"{tier} standard error"] for r in some]
+        axes.errorbar(true, said, spread, fmt="o", markersize=4, label=tier)
+        limits = [min(limits[0], true.min()), max(limits[1], true.max())]
+    axes.plot(limits, limits, color="grey", linewidth=1)
+    axes.set(xscale="log", yscale="log", xlabel="true", ylabel="estimated")
+    axes.legend()
+    return figure
 
 
 def _estimates(found: Mapping[str, Mapping[str, float]], tiers: list[str]) -> str:

@@ -33,21 +33,18 @@ class Tier(NamedTuple):
     denoisings: float
 
 
+_BALANCED = (
+    *("path-tracing", "oidn", "oidn-demodulated", "nonlocal-means"),
+    *("whitened", "multi-scale"),
+)
+
 TIERS: dict[str, Tier] = {
     "fast": Tier("`multi-scale` with one denoised image", ("oidn",), 1.5),
-    "balanced": Tier(
-        "ensemble of a few denoisers",
-        ("oidn", "oidn-color", "nonlocal-means", "multi-scale", "path-tracing"),
-        11.0,
-    ),
+    "balanced": Tier("ensemble of a few estimates", _BALANCED, 10.0),
     "best": Tier(
-        "ensemble of many denoisers and combiners",
-        (
-            *("oidn", "oidn-color", "oidn-demodulated", "oidn-clean", "pd"),
-            *("bilateral", "rdfc", "nonlocal-means"),
-            *("multi-scale", "double-shrinkage", "path-tracing"),
-        ),
-        70.0,
+        "ensemble of more denoisers and combiners",
+        (*_BALANCED, "bilateral", "oidn-clean", "pd", "double-shrinkage"),
+        60.0,
     ),
 }
 """By name, the cheapest first."""
