@@ -11,7 +11,15 @@ from jax.test_util import check_grads
 
 from jscomb import metrics
 from jscomb.denoisers import oidn
-from jscomb.denoisers.oidn import _denoise, _filter, _frame, _host, _network, _weights
+from jscomb.denoisers.oidn import (
+    _denoise,
+    _filter,
+    _frame,
+    _host,
+    _network,
+    _tuning,
+    _weights,
+)
 from jscomb.denoisers.oidn._models import MODELS, Model
 from jscomb.frame import Package, make_frame
 from jscomb.metrics import rel_l2
@@ -513,3 +521,52 @@ def test_derivatives_at_ugly_pixels(frame, value):
     slope = jax.grad(lambda x: run(x).sum())(x)
     for image in (y, moved, slope):
         assert np.isfinite(image).all()
+
+
+def textured(rng, *, buffers, size=48):
+    """A frame of a fine texture, which the denoiser takes for noise, and the truth."""
+    truth = np.broadcast_to(
+        1 + 0.5 * rng.uniform(-1, 1, (size, size, 1)), (size,) * 2 + (3,)
+    )
+    noise = 0.2 * 4**0.5 * (rng.exponential(size=(buffers, *truth.shape)) - 1)
+    frame = make_frame(truth + noise * (buffers / 4) ** 0.5).normalised(1.0)
+    return frame, jnp.asarray(truth)
+
+
+def test_tuning_lowers_an_error_that_it_does_not_see(rng):
+    """It is given the halves, and judged by the truth."""
+    frame, truth = textured(rng, buffers=2)
+    error = lambda image: rel_l2(jnp.asarray(image, truth.dtype), truth)
+    before = error(oidn.denoise_frame(frame).image)
+    after = error(oidn.tune_frame(frame).image)
+    assert after < 0.8 * before
+
+
+def test_a_tuned_half_sees_its_own_samples_alone(rng):
+    """Or it would say nothing that is independent of the other half."""
+    frame, _ = textured(rng, buffers=4, size=16)
+    changed = frame.buffers.color.at[2:].multiply(1.5)
+    other = frame._replace(buffers=frame.buffers._replace(color=changed))
+    one, two = (oidn.tune_frame(each, steps=2) for each in (frame, other))
+    np.testing.assert_array_equal(one.halves[0], two.halves[0])
+    for a, b in ((one.image, two.image), (one.halves[1], two.halves[1])):
+        assert relative(a, b) > 1e-3
+    assert oidn.tune_frame(frame.merged(2), steps=1).halves is None
+    with pytest.raises(ValueError, match=r"oidn.tune needs half buffers"):
+        oidn.tune(frame.merged(1))
+
+
+@pytest.mark.parametrize("value", [1e6, np.nan, np.inf])
+def test_the_weight_of_tuning_does_not_see_the_target(rng, value):
+    """So the loss is unbiased; and one bad pixel of a target leaves all finite."""
+    frame, _ = textured(rng, buffers=2, size=16)
+    a, b = frame.halves()
+    bad = b._replace(
+        buffers=b.buffers._replace(color=b.buffers.color.at[0, 3, 4].set(value))
+    )
+    weights = [_tuning._pair(a, each).weight for each in (b, bad)]
+    np.testing.assert_array_equal(*weights)
+    color = frame.buffers.color.at[1, 3, 4].set(value)
+    ugly = frame._replace(buffers=frame.buffers._replace(color=color))
+    network = oidn.tune(ugly, steps=2)
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(network))

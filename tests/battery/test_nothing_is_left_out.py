@@ -44,6 +44,8 @@ ELSEWHERE = {
         "oidn.denoise_frame",
         "oidn.denoise_turns",
         "oidn.denoise_variants",
+        "oidn.tune",
+        "oidn.tune_frame",
         "progressive.combine_frame",
         "progressive.neural_combine_frame",
         "progressive.neural_inputs",

@@ -11,6 +11,7 @@ from experiments.common import command, errors
 from experiments.comparison import (
     convergence,
     equal_time,
+    members,
     page,
     pareto,
     pixels,
@@ -225,3 +226,30 @@ def test_changes_of_pixels_add_up(glass_frame):
     assert 1 - x.removed + x.added == pytest.approx(ratio, rel=1e-4)
     with pytest.raises(ValueError, match="no reference"):
         pixels.changed(y, frame._replace(reference=None))
+
+
+def test_members_join_as_long_as_they_pay():
+    """By what they bring for their cost; those of little use never."""
+    costs = {"path-tracing": 0.0, "oidn": 3.0, "whitened": 0.1, "bilateral": 3.0}
+    costs |= {"nonlocal-means": 2.0}
+    factor = {"whitened": 0.95, "bilateral": 0.8, "nonlocal-means": 0.995}
+    error = lambda some, case: float(np.prod([factor.get(m, 1.0) for m in some]))
+    path = members.joined(["a 16", "b 16"], tuple(factor), costs, error)
+    assert path.members == (*members.START, "whitened", "bilateral")
+    assert path.costs == pytest.approx((3.0, 3.1, 6.1))
+    assert path.within(4.0) == (*members.START, "whitened")
+    assert path.within(0.0) == members.START
+    assert members.cost_of(("whitened",), costs) == pytest.approx(3.1)
+
+
+def test_members_are_judged_without_their_scene(glass_frame, tmp_path):
+    for scene in ("a", "b"):
+        exr.write_frame(tmp_path / f"{scene}-64.exr", glass_frame)
+    config = members.Config(
+        tmp_path, tmp_path / "estimates", tmp_path / "results.jsonl", quick=True
+    )
+    found = members.run(config)
+    assert all(0 < error < 1 for error in found["left out"][60.0].values())
+    assert found["path"][0][0] == "oidn"
+    said = members.report(found)
+    assert f"{found['left out'][60.0]['a 64']:.3f}" in said.answer

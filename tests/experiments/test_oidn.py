@@ -2,7 +2,8 @@
 
 import pytest
 
-from experiments.oidn import network, sure, variants
+from experiments.oidn import network, sure, tuning, variants
+from jscomb import exr
 from jscomb.denoisers import oidn
 from jscomb.denoisers.oidn._models import MODELS
 
@@ -41,3 +42,12 @@ def test_network_against_filter(folder):
     said = network.report(found)
     assert f"All {len(MODELS)} networks make the filter's image" in said.answer
     assert "| 48² | large |" in said.body
+
+
+def test_tuning_in_ensembles(glass_frame, tmp_path):
+    exr.write_frame(tmp_path / "glass-64.exr", glass_frame._replace(estimates={}))
+    config = tuning.Config(tmp_path, tmp_path / "estimates", quick=True)
+    (row,) = tuning.run(config).values()
+    assert 0.3 < row["frame"] < 3
+    assert 0.5 < row["balanced"] < 1.5
+    assert f"{row['best']:.3f}" in tuning.report({"glass 64": row}).answer

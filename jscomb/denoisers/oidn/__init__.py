@@ -21,6 +21,8 @@ Guards: the bare filter is not scale-equivariant at very low radiance, one infin
 pixel corrupts a large area, and NaN counts as black. So images are normalised to a
 median luminance of one, and each invalid pixel is filled from its neighbours first.
 
+`tune` fits the network's gains and biases to one frame by its halves.
+
 Images [H,W,3], linear radiance. Needs the extra `oidn` (`pip install "jscomb[oidn]"`).
 
 Source: A. T. Afra, "Intel Open Image Denoise", 2025, version 2.5 (Apache-2.0); its
@@ -43,9 +45,11 @@ from jscomb.denoisers.oidn._frame import (
     denoise_turns,
     denoise_variants,
 )
+from jscomb.denoisers.oidn._tuning import TUNING_NEEDS, tune, tune_frame
 
 __all__ = [
     "NEEDS",
+    "TUNING_NEEDS",
     "VARIANTS",
     "Variant",
     "available",
@@ -57,4 +61,6 @@ __all__ = [
     "denoise_turns",
     "denoise_variants",
     "pretrained",
+    "tune",
+    "tune_frame",
 ]
