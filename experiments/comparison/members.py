@@ -37,7 +37,7 @@ from jscomb.methods._inputs import inputs, with_input, with_inputs
 START = "path-tracing", "oidn"
 CANDIDATES = (
     *("oidn-color", "oidn-albedo", "oidn-demodulated"),
-    *("oidn-clean", "oidn-clean-balanced", "bilateral", "rdfc", "nfor"),
+    *("oidn-clean", "bilateral", "rdfc", "nfor"),
     *("nonlocal-means", "multi-scale", "whitened", "double-shrinkage"),
     *("pd", "njs", "dsc"),
 )
