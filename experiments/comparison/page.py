@@ -14,6 +14,7 @@ import pathlib
 from collections.abc import Container
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
@@ -67,7 +68,7 @@ def encoded(image: Image) -> str:
     """Half floats, row by row, as base64.
 
     Args:
-        image: linear radiance, [H,W,3].
+        image: linear radiance or another quantity, [H,W,C].
 
     Returns:
         the text; values beyond the largest half float are cut.
@@ -84,7 +85,8 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
         combiners: names of `experiments.comparison.combiners`.
 
     Returns:
-        name, width, height, images by name as text, relative L2 by name.
+        name, width, height, images by name as text, relative L2 by name; of the tiers
+        also the map of the estimated error, as text.
 
     Raises:
         ValueError: if the frame has no reference, or no denoised image.
@@ -92,8 +94,13 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
     frame = exr.read_frame(path)
     if frame.reference is None or "oidn" not in frame.estimates:
         raise ValueError(f"{path} has no reference or no biased image 'oidn'")
-    frame = frame.normalised()
-    images = {name: _made(frame, name) for name in combiners}
+    frame, key = frame.normalised(), jax.random.key(0)
+    tiers = [name for name in combiners if name in methods.TIERS]
+    made = {name: methods.combine_tier(key, frame, tier=name) for name in tiers}
+    images = {
+        name: made[name].estimate.image if name in made else _made(frame, name)
+        for name in combiners
+    }
     assert frame.reference is not None
     r, noise = frame.reference
     measured = {
@@ -107,6 +114,11 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
         "height": height,
         "images": {name: encoded(image) for name, image in images.items()},
         "errors": {name: float(error) for name, error in measured.items()},
+        "estimated": {
+            name: encoded(tier.error.map)
+            for name, tier in made.items()
+            if tier.error is not None
+        },
     }
 
 

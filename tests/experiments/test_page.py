@@ -24,7 +24,8 @@ LINES = [
 def page(tmp_path_factory):
     """The page of a made-up sweep and a real frame."""
     frames = [
-        pages.shown(DATA / f"cornell-{name}-64.exr", FEW) for name in ("glass", "box")
+        pages.shown(DATA / f"cornell-{name}-64.exr", (*FEW, "balanced"))
+        for name in ("glass", "box")
     ]
     path = tmp_path_factory.mktemp("page") / "page.html"
     path.write_text(pages.page(LINES, frames, "RMSE"))
@@ -45,6 +46,13 @@ def test_page_holds_everything(page, glass_frame):
     held = pages.encoded(glass_frame.color)
     image = np.frombuffer(base64.b64decode(held), "<f2").reshape(64, 64, 3)
     np.testing.assert_allclose(image, glass_frame.color, rtol=1e-3, atol=1e-6)
+    data = re.search(r'id="data" type="application/json">(.*?)</script>', text, re.S)
+    frames = json.loads(data[1])
+    assert list(frames[0]["estimated"]) == ["balanced"]
+    error = np.frombuffer(base64.b64decode(frames[0]["estimated"]["balanced"]), "<f2")
+    assert error.size == 64 * 64
+    true = frames[0]["errors"]["balanced"]
+    assert true / 3 < error.mean() < 3 * true
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +95,16 @@ def test_viewer_works_in_a_browser(browser, page):
     assert pixels("image") != noisy
     assert np.mean(pixels("error")) < np.mean(wrong)  # the denoised one is better
     press("4")
+    true = pixels("error")
+    press("m")
+    assert "balanced" in said()
+    assert "error as estimated" in said()
+    assert np.std(pixels("error")) > 0
+    assert pixels("error") != true
+    press("m")
+    assert pixels("error") == true
+    press("2")
+    press("5")
     assert "reference" in said()
     assert np.max(np.reshape(pixels("error"), (-1, 4))[:, :3]) == 0
     press("s")
