@@ -51,7 +51,8 @@ def demonstrate(jscomb, folder, shown=SHOWN):
 @pytest.mark.slow
 def test_demo(jscomb, tmp_path):
     for errors in demonstrate(jscomb, tmp_path / "demo"):
-        assert errors["best"] < errors["balanced"] < 1.05 * errors["fast"]
+        assert errors["best"] < 1.02 * errors["balanced"]
+        assert errors["balanced"] < errors["fast"]
         assert errors["fast"] < errors["denoised"]
 
 

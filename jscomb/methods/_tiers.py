@@ -34,7 +34,7 @@ class Tier(NamedTuple):
 
 
 _BALANCED = (
-    *("path-tracing", "oidn", "oidn-demodulated", "nonlocal-means"),
+    *("oidn", "path-tracing", "oidn-demodulated", "nonlocal-means"),
     *("whitened", "multi-scale"),
 )
 
