@@ -134,7 +134,7 @@ def strength_for(samples: Scalar | float | None) -> Scalar | float:
         t, 2 for many samples.
 
     Example:
-        >>> print(strength_for(16), strength_for(None))
+        >>> print(strength_for(16.0), strength_for(None))
         2.75 2.0
     """
     return STRENGTH if samples is None else STRENGTH + _FEW / samples
