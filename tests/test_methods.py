@@ -133,7 +133,8 @@ def test_a_tier_is_better_than_what_it_is_made_of(tier):
         by_name = combine(key(), frame, method=tier)
         np.testing.assert_array_equal(by_name.image, made.estimate.image)
     assert max(ratios) < 1.05
-    assert np.prod(ratios) ** 0.5 < 0.85
+    most = {"fast": 0.82, "balanced": 0.7, "best": 0.43}
+    assert np.prod(ratios) ** 0.5 < most[tier]
 
 
 @needs_oidn

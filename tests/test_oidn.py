@@ -528,8 +528,8 @@ def textured(rng, *, buffers, size=48):
     truth = np.broadcast_to(
         1 + 0.5 * rng.uniform(-1, 1, (size, size, 1)), (size,) * 2 + (3,)
     )
-    noise = 0.2 * 4**0.5 * (rng.exponential(size=(buffers, *truth.shape)) - 1)
-    frame = make_frame(truth + noise * (buffers / 4) ** 0.5).normalised(1.0)
+    noise = 0.2 * (rng.exponential(size=(buffers, *truth.shape)) - 1)
+    frame = make_frame(truth + buffers**0.5 * noise).normalised(1.0)
     return frame, jnp.asarray(truth)
 
 

@@ -7,7 +7,7 @@ mirrored to 512x512, with the halves, and with `oidn` for what is made of it.
 
 A choice says nothing of the scenes that it was made on. So it is made once for every
 scene without that scene, whose frames then judge it: those are the numbers of "left
-out".
+out". The list of candidates and the least gain were set with all scenes in sight.
 """
 
 import dataclasses
@@ -42,6 +42,7 @@ CANDIDATES = (
     *("pd", "njs", "dsc"),
 )
 LEAST = 0.01  # of the error, that a member must lower it by
+_FREE = 0.05  # denoisings; what costs less is as good as free
 _SIZE = 512  # pixels along the side of the frame whose costs are measured
 
 Members = tuple[str, ...]
@@ -103,7 +104,7 @@ def joined(
         left = [c for c in left if gain[c] > LEAST]
         if not left:
             break
-        chosen = max(left, key=lambda c: gain[c] / max(price[c], 0.05))
+        chosen = max(left, key=lambda c: gain[c] / max(price[c], _FREE))
         members, now = (*members, chosen), now - gain[chosen]
         left.remove(chosen)
         spent.append(cost_of(members, costs))

@@ -3,8 +3,7 @@
 Frames of `experiments.data.development`. Relative L2, less the reference's noise,
 of `oidn.tune_frame` over that of `oidn`, for the frame and for its halves, each tuned
 on its own two sub-buffers; and of the tiers' ensembles with the tuned estimate over
-those without. Nothing was set on these scenes but the rate, .001, and the number of
-steps, 40, on five of them.
+those without. The rate and the number of steps were set on five of these scenes.
 """
 
 import dataclasses

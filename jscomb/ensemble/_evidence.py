@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import (
     check_same_shape,
-    divide,
     masked_mean,
     weighted_ratio,
     zero_invalid,
 )
 from jscomb.numerics.medians import median_of
-from jscomb.numerics.windows import block_sum, window_mean, window_sum
+from jscomb.numerics.variances import relative_precision
+from jscomb.numerics.windows import block_sum, window_sum
 from jscomb.typing import Image, Mask, Variance
 
 Bases = Float[Array, "n h w c"]
@@ -26,8 +26,6 @@ Count = Float[Array, "rows columns 1"]
 
 # Added to squared radiances, of the frame's mean squared: limits black pixels.
 _FLOOR = 0.01
-_NOISE = 10.0  # relative variance, times this, that halves the weight of a pixel
-_NOISE_WINDOW = 9  # pixels that it is averaged over
 
 
 class Evidence(NamedTuple):
@@ -101,14 +99,9 @@ def _weight(
     that a base lets through would hide there.
     """
     if variance is None:
-        square = scale
-    else:
-        _, clean = zero_invalid(variance)
-        noise = jnp.mean(clean, axis=-1, keepdims=True)
-        relative = divide(noise, scale, where=valid & (scale > 0))
-        near = window_mean(relative, _NOISE_WINDOW, mask=valid)
-        square = scale * (1 + _NOISE * near)
-    return divide(jnp.ones_like(square), square, where=valid & (square > 0))
+        return relative_precision(scale, None, valid)
+    _, clean = zero_invalid(variance)
+    return relative_precision(scale, jnp.mean(clean, axis=-1, keepdims=True), valid)
 
 
 def pooled(values: Packed, count: Count, window: int | None) -> Packed:

@@ -131,11 +131,13 @@ def strength_for(samples: Scalar | float | None) -> Scalar | float:
         samples: a pixel; None if unknown.
 
     Returns:
-        t, 2 for many samples.
+        t, without unit: 2 + 12 / samples.
 
     Example:
         >>> print(strength_for(16.0), strength_for(None))
         2.75 2.0
+
+    Source: ours; set so that eleven path-traced scenes are never made 1 % worse.
     """
     return STRENGTH if samples is None else STRENGTH + _FEW / samples
 

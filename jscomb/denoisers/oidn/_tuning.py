@@ -21,16 +21,15 @@ from jaxtyping import Float
 
 from jscomb.denoisers.oidn._denoise import NEEDS, denoise_normalised, pretrained
 from jscomb.frame import Estimate, Frame, with_halves
-from jscomb.numerics.guards import divide, zero_invalid
+from jscomb.numerics.guards import zero_invalid
 from jscomb.numerics.tiles import compiled
-from jscomb.numerics.windows import window_mean
+from jscomb.numerics.variances import relative_precision
 from jscomb.typing import Image
 
 TUNING_NEEDS = NEEDS._replace(halves=True)
 _STEPS = 40
 _RATE = 0.001  # of Adam
 _CROP = 256  # pixels along the side of what a step sees
-_NOISE, _NOISE_WINDOW = 10.0, 9  # see `ensemble.error_matrix`
 
 Shifts = list[Array]  # a gain or a bias of every channel, layer by layer
 
@@ -158,18 +157,16 @@ def _weight(x: Image, y: Image) -> Float[Array, "h w 1"]:
     valid, x, y = zero_invalid(x, y)
     square = jnp.square(jnp.mean(y, axis=-1, keepdims=True))
     square += 0.01 * jnp.mean(square)
-    some = valid & (square > 0)
     noise = jnp.mean(jnp.square(x - y), axis=-1, keepdims=True)
-    relative = divide(noise, square, where=some)
-    near = window_mean(relative, _NOISE_WINDOW, mask=valid)
-    return divide(jnp.ones_like(square), square * (1 + _NOISE * near), where=some)
+    return relative_precision(square, noise, valid)
 
 
 def _crop(pair: _Pair, random: np.random.Generator) -> _Pair:
     """A part of the images, somewhere."""
-    start = [int(random.integers(max(n - _CROP, 0) + 1)) for n in pair.color.shape[:2]]
-    (top, left), size = start, _CROP
-    cut = lambda image: image[top : top + size, left : left + size]
+    top, left = (
+        int(random.integers(max(n - _CROP, 0) + 1)) for n in pair.color.shape[:2]
+    )
+    cut = lambda image: image[top : top + _CROP, left : left + _CROP]
     return jax.tree.map(cut, pair)
 
 
@@ -197,8 +194,10 @@ def _loss(network: Any, shifts: Shifts, *, pair: _Pair) -> Array:
 def _shifted(network: Any, shifts: Shifts) -> Any:
     """The network with gains of its weights and biases added to its own."""
     leaves, tree = jax.tree.flatten(network)
-    moved = []
-    for leaf, shift in zip(leaves, shifts, strict=True):
-        gain = 1 + shift.reshape(*(1,) * (leaf.ndim - 1), -1)
-        moved.append(leaf * gain if leaf.ndim > 1 else leaf + shift)
-    return jax.tree.unflatten(tree, moved)
+
+    def moved(leaf: Array, shift: Array) -> Array:
+        if leaf.ndim == 1:
+            return leaf + shift
+        return leaf * (1 + shift.reshape(*(1,) * (leaf.ndim - 1), -1))
+
+    return jax.tree.unflatten(tree, map(moved, leaves, shifts))
