@@ -94,6 +94,15 @@ def test_variance_is_that_of_the_mean(tmp_path):
     np.testing.assert_allclose(frame.variance[..., 1], variance / 4, rtol=1e-5)
 
 
+def test_one_sample_a_sub_buffer(mitsuba):
+    """Has no variance by itself; the frame's is from the spread of the sub-buffers."""
+    frame = rendering.render(SCENE, Settings(spp=4, size=8, buffers=4, feature_spp=1))
+    assert frame.sub_buffers == 4
+    assert frame.buffers.variance is None
+    spread = np.var(frame.buffers.color, axis=0, ddof=1) / 4
+    np.testing.assert_allclose(frame.variance, spread, rtol=1e-5)
+
+
 def test_resumes_where_it_was_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(_partial, "SAVE_EVERY", 0.0)
     partial = tmp_path / "frame.partial.npz"

@@ -72,3 +72,24 @@ def test_samples_of_one_pass_differ(samples):
 def test_pixel_by_pixel_variants_are_refused():
     with pytest.raises(ValueError, match=r"need a vectorised variant.*scalar_rgb"):
         streams.register(types.SimpleNamespace(variant=lambda: "scalar_rgb"))
+
+
+@pytest.mark.parametrize("variant", ["vectorised", "scalar"])
+def test_samples_rendered_together_are_single_samples(vectorised, variant):
+    """Means and variances as of one launch a sample; no two samples are alike."""
+    before = vectorised.variant()
+    if variant == "scalar":
+        vectorised.set_variant("scalar_rgb")
+    try:
+        launch = Launcher("cornell-box", Settings(spp=4, size=16))
+        together = [launch(Pass("", 16, 1000 + k, "samples")) for k in range(16)]
+        together = np.concatenate(together)
+        alone = np.stack([launch(Pass("", 1, k, "path")) for k in range(256)])
+    finally:
+        vectorised.set_variant(before)
+    assert together.shape == alone.shape
+    means = [images.mean(axis=(1, 2, 3)) for images in (together, alone)]
+    assert_mean(means[0] - means[1], 0.0)
+    spread = [np.log1p(images).var(axis=0).mean() for images in (together, alone)]
+    assert spread[0] == pytest.approx(spread[1], rel=0.1)
+    assert len(np.unique(together.mean(axis=(1, 2, 3)))) == 256

@@ -1,38 +1,96 @@
-"""Frames to train on: random scenes, each at some sample counts, with a reference.
+"""Frames to train, to validate and to test on: views of real and of random scenes.
 
-Every frame is an EXR file by `jscomb render`: two half buffers with variances
-and features, Open Image Denoise of the frame and of its halves, and a reference. The
-sample counts of a scene are drawn from powers of two between 4 and 256 and its frames
-share one reference; their noise is independent of it and of each other. The same
-command resumes an interrupted run, and with more scenes adds to the existing ones.
+A view is a variation of a real scene (`variations`) or a random scene
+(`rendering`, random-SEED), rendered at several sample counts with four sub-buffers and
+features, denoised, and photon mapped with halves. Its frames share one reference and
+one photon-mapped image; their noise is independent of both and of each other. OUT gets
+a folder a split, frames VIEW-SPP.exr in it; the same command resumes an interrupted
+run. `--sheet` prints what is there.
 
-A reference of 1024 samples is itself noisy, which does not matter to a squared error:
-with a reference r + e, E[e] = 0 and e independent of the inputs, the expected loss is
-that of r plus the variance of e, whatever the network's output, so its gradient is
-unbiased. It is slightly biased for absolute errors, and by the weights that a relative
-error takes from r; less so with more samples.
+Splits are by scene: no view of a scene that is trained on is in another split. The test
+split is for final figures only; choices are made on the validation split.
+
+References of training views are noisy. A squared error whose weight does not depend on
+the reference has the gradient of a clean one nevertheless (`learning.losses`); those of
+validation and test views have four times the samples, and `metrics` subtract what noise
+is left.
 """
 
-import concurrent.futures
 import dataclasses
-import multiprocessing
+import functools
 import pathlib
 import time
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 from experiments.common.command import tool
-from jscomb.cli import render_file
+from experiments.common.processes import in_fresh_processes
+from experiments.common.tables import table
+from experiments.data import variations
+from experiments.data.development import noise
+from jscomb import exr, methods, rendering
 from jscomb.denoisers import oidn
-from jscomb.rendering import Settings
+from jscomb.rendering import PHOTONS, Settings
 
-COUNTS = (4, 8, 16, 32, 64, 128, 256)
-SCENES_A_PROCESS = 10
-STREAMS = 100_000  # difference of the seeds of one scene's frames
+BUFFERS = 4
+STREAMS = 1_000_000  # difference of the seeds of one view's frames
+VIEWS_A_PROCESS = 8
+PHOTONS_A_PASS = 100_000
+PASSES = (8, 16, 32, 64)  # of photon mapping
+LOW, MIDDLE, HIGH = (4, 8, 16), (32, 64, 128), (256, 512, 1024, 2048, 4096)
+RARE = (0.35, 0.3, 0.2, 0.1, 0.05)  # probabilities of HIGH: cost grows with samples
+
+
+class Split(NamedTuple):
+    """What a split is made of.
+
+    Attributes:
+        scenes: real ones.
+        variations: of each.
+        random: number of random scenes.
+        first: seed of the first one.
+        reference_spp: samples a pixel of references.
+        counts: sample counts of every view; none for three drawn ones.
+    """
+
+    scenes: tuple[str, ...]
+    variations: int
+    random: int
+    first: int
+    reference_spp: int
+    counts: tuple[int, ...] = ()
+
+
+SPLITS = {
+    "train": Split(
+        ("bathroom", "cornell-box", "glass-of-water", "living-room-2"),
+        variations=17,
+        random=96,
+        first=1000,
+        reference_spp=1024,
+    ),
+    "validate": Split(
+        ("dining-room", "veach-mis"),
+        variations=5,
+        random=10,
+        first=2000,
+        reference_spp=4096,
+        counts=(8, 32, 128, 512),
+    ),
+    "test": Split(
+        ("living-room", "staircase2", "veach-bidir"),
+        variations=5,
+        random=12,
+        first=3000,
+        reference_spp=4096,
+        counts=(4, 16, 64, 256, 1024),
+    ),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,63 +99,111 @@ class Config:
 
     Attributes:
         out: folder of the frames.
-        scenes: how many scenes.
-        counts: sample counts of each.
+        scenes: folder of the real scenes, a folder with a scene.xml each.
+        splits: which of the splits, in order.
         size: width and height in pixels.
-        reference_spp: samples a pixel of each scene's reference.
-        seed: of the first scene; the others' follow.
+        sheet: print what is there and render nothing.
+        quick: one random scene a split, tiny.
     """
 
     out: tyro.conf.Positional[pathlib.Path]
-    scenes: int = 100
-    counts: int = 2
+    scenes: pathlib.Path
+    splits: tuple[str, ...] = ("validate", "train", "test")
     size: int = 128
-    reference_spp: int = 1024
-    seed: int = 0
+    sheet: bool = False
+    quick: bool = False
 
     def __post_init__(self) -> None:
-        """Raise for options out of range."""
-        if not 1 <= self.counts <= len(COUNTS):
-            raise ValueError(f"counts must be 1 to {len(COUNTS)}, got {self.counts}")
-        if self.scenes < 1 or self.reference_spp < 1024:
+        """Raise for an unknown split."""
+        if wrong := set(self.splits) - set(SPLITS):
             raise ValueError(
-                "dataset wants at least one scene and references of at least 1024 "
-                f"samples, got {self.scenes} and {self.reference_spp}"
+                f"no split {', '.join(wrong)}; there are {', '.join(SPLITS)}"
             )
 
 
-class Job(NamedTuple):
-    """One frame's scene, file, settings, and the file that holds its reference."""
+class View(NamedTuple):
+    """One view of a scene.
 
+    Attributes:
+        split: train, validate or test.
+        scene: a real one's name, or "random".
+        seed: of the variation or of the random scene.
+    """
+
+    split: str
     scene: str
-    out: pathlib.Path
-    settings: Settings
-    reference_from: pathlib.Path | None
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """As in the names of its files."""
+        return f"{self.scene}-{self.seed:04d}"
 
 
-def jobs(config: Config, scene: int) -> Iterator[Job]:
-    """Return what to render of one scene; the first frame's reference is shared.
+def views(config: Config) -> list[View]:
+    """List the views, those of all scenes in turn, so that any part is varied.
 
     Args:
-        config: which frames.
-        scene: seed of the scene.
+        config: which splits.
+
+    Returns:
+        the views.
+    """
+    found = []
+    for name in config.splits:
+        split = SPLITS[name]
+        if config.quick:
+            split = split._replace(scenes=(), random=1)
+        rows = [
+            [View(name, s, k) for k in range(split.variations)] for s in split.scenes
+        ]
+        rows += [[View(name, "random", split.first + k) for k in range(split.random)]]
+        longest = max(map(len, rows))
+        spread = [
+            (k * longest / len(row), view) for row in rows for k, view in enumerate(row)
+        ]
+        found.append([view for _, view in sorted(spread)])
+    return [view for split in found for view in split]
+
+
+def counts(view: View) -> list[int]:
+    """Return the sample counts of a view's frames.
+
+    Args:
+        view: which.
+
+    Returns:
+        of its split, or one each of few, some and many samples.
+    """
+    fixed = SPLITS[view.split].counts
+    if fixed:
+        more = fixed[-1] * 4  # every other view reaches farther
+        return [*fixed, more] if view.seed % 2 == 0 else list(fixed)
+    rng = np.random.default_rng([_number(view), 0xC0417])
+    drawn = rng.choice(LOW), rng.choice(MIDDLE), rng.choice(HIGH, p=RARE)
+    return [int(count) for count in drawn]
+
+
+def frames(folder: pathlib.Path, split: str) -> Iterator[tuple[str, int, pathlib.Path]]:
+    """List the frames of a split.
+
+    Args:
+        folder: that `run` wrote.
+        split: train, validate or test.
 
     Yields:
-        one frame each, most samples first.
+        view, samples a pixel and file, by view and samples.
+
+    Raises:
+        ValueError: if there are none.
     """
-    rng = np.random.default_rng([scene, 0xC0417])
-    counts = sorted(rng.choice(COUNTS, config.counts, replace=False), reverse=True)
-    first = None
-    for number, spp in enumerate(counts):
-        out = config.out / f"random-{scene:05d}-{spp}.exr"
-        settings = Settings(
-            spp=int(spp),
-            size=config.size,
-            reference_spp=0 if first else config.reference_spp,
-            seed=number * STREAMS,
-        )
-        yield Job(f"random-{scene}", out, settings, first)
-        first = first or out
+    found = []
+    for path in (folder / split).glob("*.exr"):
+        view, _, samples = path.stem.rpartition("-")
+        found.append((view, int(samples), path))
+    if not found:
+        raise ValueError(f"{folder / split}: no frames there; experiments.data.dataset")
+    yield from sorted(found)
 
 
 def run(config: Config) -> list[pathlib.Path]:
@@ -113,34 +219,133 @@ def run(config: Config) -> list[pathlib.Path]:
         ImportError: without Open Image Denoise.
         RuntimeError: if the renderer crashed; the same command resumes.
     """
+    if config.sheet:
+        print(sheet(config.out))
+        return sorted(config.out.glob("*/*.exr"))
     if not oidn.available():
         raise ImportError('a dataset needs a denoiser: pip install "jscomb[oidn]"')
-    config.out.mkdir(parents=True, exist_ok=True)
-    start, seeds = time.monotonic(), range(config.seed, config.seed + config.scenes)
-    every = {seed: list(jobs(config, seed)) for seed in seeds}
-    todo = {s: [f for f in fs if not f.out.exists()] for s, fs in every.items()}
-    # One process for a few scenes: Dr.Jit keeps every scene's compiled code, and was
-    # observed to crash after about ninety.
-    with concurrent.futures.ProcessPoolExecutor(
-        max_workers=1,
-        mp_context=multiprocessing.get_context("spawn"),
-        max_tasks_per_child=SCENES_A_PROCESS,
-    ) as process:
-        rendered = process.map(_render_all, filter(None, todo.values()))
-        missing = sum(map(bool, todo.values()))
-        made = sum(tqdm(rendered, total=missing, unit="scene", desc="dataset"))
-    files = [frame.out for frames in every.values() for frame in frames]
-    megabytes = sum(f.stat().st_size for f in files) / 1e6
-    minutes = (time.monotonic() - start) / 60
-    print(f"{len(files)} frames, {megabytes:.0f} MB; {made} made in {minutes:.1f} min")
-    return files
+    for split in config.splits:
+        (config.out / split).mkdir(parents=True, exist_ok=True)
+    start, todo = time.monotonic(), views(config)
+    # Dr.Jit keeps every scene's compiled code, and was observed to crash after ninety.
+    render = functools.partial(_render, config)
+    made = in_fresh_processes(render, todo, each=VIEWS_A_PROCESS)
+    number = sum(tqdm(made, total=len(todo), unit="view", desc="dataset"))
+    print(f"{number} frames made in {(time.monotonic() - start) / 60:.1f} min")
+    return sorted(config.out.glob("*/*.exr"))
 
 
-def _render_all(frames: list[Job]) -> int:
-    """Render frames, and return how many."""
-    for scene, out, settings, reference in frames:
-        render_file(scene, out, settings, reference_from=reference)
-    return len(frames)
+def sheet(folder: pathlib.Path) -> str:
+    """Describe the frames of a folder.
+
+    Args:
+        folder: that `run` wrote.
+
+    Returns:
+        a table of splits: scenes, views, frames, sample counts, photon-mapped images,
+        size on disk and the relative L2 of the references' own noise.
+    """
+    rows = []
+    for split in SPLITS:
+        files = list(frames(folder, split))
+        names = {name: path for name, _, path in files}
+        scenes = {name.rpartition("-")[0] for name in names}
+        random = sum(name.startswith("random") for name in names)
+        spp = sorted({count for _, count, _ in files})
+        noises = [noise(path) for path in names.values()]
+        rows.append(
+            [
+                split,
+                ", ".join(sorted(scenes - {"random"})),
+                random,
+                len(names),
+                len(files),
+                f"{spp[0]} to {spp[-1]}",
+                sum(PHOTONS in exr.read_frame(p).estimates for p in names.values()),
+                round(sum(path.stat().st_size for *_, path in files) / 1e6),
+                float(np.median(noises)),
+                float(np.max(noises)),
+            ]
+        )
+    header = ["split", "real scenes", "random scenes", "views", "frames", "samples"]
+    header += ["photon mapped", "MB", "reference noise, median", "maximum"]
+    return table(header, rows)
+
+
+def _number(view: View) -> int:
+    """A seed of a view's own."""
+    names = sorted({s for split in SPLITS.values() for s in split.scenes})
+    place = names.index(view.scene) + 1 if view.scene in names else 0
+    return 10_000 * place + view.seed
+
+
+def _render(config: Config, view: View) -> int:
+    """Render a view's frames that are missing, and return how many."""
+    folder = config.out / view.split
+    files = {n: folder / f"{view.name}-{n}.exr" for n in counts(view)}
+    blind = folder / f"{view.name}.blind"
+    todo = {n: path for n, path in files.items() if not path.exists()}
+    if not todo or blind.exists():
+        return 0
+    scene = _source(config, view)
+    if scene is None:
+        blind.touch()
+        return 0
+    first = next(iter(files.values()))
+    for number, (spp, path) in enumerate(files.items()):
+        if path.exists():
+            continue
+        settings = _settings(config, view, number, spp)
+        shared = None if path == first else exr.read_frame(first)
+        partial = path.with_suffix(".partial.npz")
+        frame = rendering.render(
+            scene,
+            settings,
+            reference=shared and shared.reference,
+            partial=partial,
+        )
+        if shared:
+            frame = frame.with_estimate(PHOTONS, shared.estimates[PHOTONS])
+        denoised = methods.combine(jax.random.key(0), frame, method="oidn")
+        frame = frame.with_estimate("oidn", denoised)
+        about = rendering.provenance(scene, settings)
+        exr.write_frame(path, frame, provenance=about)
+        partial.unlink(missing_ok=True)
+    return len(todo)
+
+
+def _source(config: Config, view: View) -> str | None:
+    """The scene to render; None if its camera sees nothing."""
+    if view.scene == "random":
+        name = f"random-{view.seed}"
+        preview = rendering.load_scene(
+            name, width=variations.PREVIEW, height=variations.PREVIEW
+        )
+        return name if variations.sees_something(preview) else None
+    path = config.out / view.split / f"{view.name}.xml"
+    original = config.scenes / view.scene / "scene.xml"
+    if not original.is_file():
+        raise ValueError(f"{original}: no such file; it is scene {view.scene}")
+    if not path.exists() and not variations.write_variation(original, view.seed, path):
+        return None
+    return str(path)
+
+
+def _settings(config: Config, view: View, number: int, spp: int) -> Settings:
+    """What is rendered: the first frame brings the reference and the photons."""
+    more: dict[str, Any] = {}
+    if number == 0:
+        rng = np.random.default_rng([_number(view), 0xF0705])
+        more = {
+            "reference_spp": SPLITS[view.split].reference_spp,
+            "photons": PHOTONS_A_PASS,
+            "passes": int(rng.choice(PASSES)),
+        }
+    size = config.size
+    if config.quick:
+        size, spp = 16, 8
+        more = {"reference_spp": 64, "photons": 1000, "passes": 4} if more else {}
+    return Settings(spp=spp, size=size, buffers=BUFFERS, seed=number * STREAMS, **more)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,8 @@ A reference is the mean of two halves, whose difference says how noisy it is:
 `metrics.rel_l2` subtracts from what it measures.
 """
 
-import concurrent.futures
 import dataclasses
-import multiprocessing
+import functools
 import pathlib
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -22,6 +21,7 @@ import tyro
 from tqdm import tqdm
 
 from experiments.common.command import tool
+from experiments.common.processes import in_fresh_processes
 from experiments.common.tables import table
 from jscomb import exr
 from jscomb.cli import render_file
@@ -102,13 +102,8 @@ def run(config: Config) -> list[pathlib.Path]:
     for scene in chosen:
         _source(config, scene)  # a missing one is found before hours of rendering
     # One process a scene: Dr.Jit keeps compiled code as long as a process lives.
-    with concurrent.futures.ProcessPoolExecutor(
-        max_workers=1,
-        mp_context=multiprocessing.get_context("spawn"),
-        max_tasks_per_child=1,
-    ) as process:
-        made = process.map(_render, [config] * len(chosen), chosen)
-        files = list(tqdm(made, total=len(chosen), unit="scene", desc="development"))
+    made = in_fresh_processes(functools.partial(_render, config), chosen)
+    files = list(tqdm(made, total=len(chosen), unit="scene", desc="development"))
     rows = [
         (s.name, s.reference_spp, noise(f[0]))
         for s, f in zip(chosen, files, strict=True)

@@ -2,7 +2,7 @@
 
 Such weights have no separable form. A network predicts many: 225 a pixel for windows of
 15 take 0.9 GB a megapixel, so `predicted_mean` makes and uses them a strip of rows at a
-time. The sums walk the window row by row, so that neither the value nor the reverse
+time. The sums walk the window pixel by pixel, so that neither the value nor the reverse
 derivative ever holds w² shifted copies of the image.
 
 Layout: images [H,W,C] of any unit, which is that of the means; kernels [H,W,w²], at
@@ -143,21 +143,19 @@ def _weighted_sum(
 ) -> Image:
     """Sum over windows of an image that has w // 2 more pixels on every side."""
     h, w, _ = weights.shape
-    rows = jnp.moveaxis(weights.reshape(h, w, window, window), 2, 0)
+    # Channels first: every step reads and writes whole images in their order.
+    image, taps = (jnp.moveaxis(array, -1, 0) for array in (padded, weights))
 
     @jax.checkpoint
-    def add_row(total: Image, row: tuple[Array, Array]) -> tuple[Image, None]:
-        number, weight = row
-        strip = lax.dynamic_slice_in_dim(padded, number, h, axis=0)
-        for column in range(window):
-            near = lax.slice_in_dim(strip, column, column + w, axis=1)
-            total = total + weight[..., column : column + 1] * near
-        return total, None
+    def add(total: Array, tap: tuple[Array, Array]) -> tuple[Array, None]:
+        number, weight = tap
+        corner = (jnp.zeros_like(number), number // window, number % window)
+        near = lax.dynamic_slice(image, corner, (image.shape[0], h, w))
+        return total + weight[None] * near, None
 
-    start = jnp.zeros((h, w, padded.shape[-1]), padded.dtype)
-    # Scan over the rows of weights: were they sliced inside the loop, every step would
-    # add its derivative to an array of all weights.
-    return lax.scan(add_row, start, (jnp.arange(window), rows))[0]
+    start = jnp.zeros((image.shape[0], h, w), padded.dtype)
+    total, _ = lax.scan(add, start, (jnp.arange(window**2), taps))
+    return jnp.moveaxis(total, 0, -1)
 
 
 def _mean(sums: Float[Array, "h w _"]) -> Float[Array, "h w _"]:

@@ -8,6 +8,7 @@ import numpy as np
 from jscomb.rendering._photon_mapping import relative_radius
 from jscomb.rendering._settings import REFERENCE_CHUNK, Settings
 
+SAMPLES = "samples"  # the path integrator, each sample an image of its own
 PHOTONS = "photons"  # the name of the photon-mapped estimate
 PHOTON_STREAMS = 10**8  # beyond the path tracer's
 
@@ -19,7 +20,8 @@ class Pass(NamedTuple):
         target: name of the moments that its image is added to.
         spp: samples a pixel.
         seed: random stream.
-        integrator: path, aov, visibility or photons.
+        integrator: path, samples (path, each sample an image of its own), aov,
+            visibility or photons.
         radius: of a photon pass, relative to the first one's.
     """
 
@@ -79,9 +81,11 @@ def plan_passes(settings: Settings) -> list[Pass]:
 
 def _passes(settings: Settings) -> Iterator[Pass]:
     """Every pass in order."""
-    seed = settings.seed
-    for number in range(settings.spp):
-        yield Pass(f"color{number % settings.buffers}", 1, seed, "path")
+    seed, together = settings.seed, settings.samples_together
+    integrator = SAMPLES if together > 1 else "path"
+    for number in range(settings.spp // together):
+        target = f"color{number % settings.buffers}"
+        yield Pass(target, together, seed, integrator)
         seed += 1
     for name in ("aov", "visibility"):
         for k in range(settings.buffers):

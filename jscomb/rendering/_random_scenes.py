@@ -3,7 +3,8 @@
 For training, so that the scenes of reported errors stay unseen. Each is a room (closed,
 open in front, or with a window to the sky) or a place under the sky, furnished with
 solids, meshes, foliage and rods. Many are hard for path tracing: small or hidden
-lights, glass, mirrors. Rooms are about two units wide, and radiance is about one.
+lights, glass, mirrors, depth of field. Rooms are about two units wide, and radiance is
+about one.
 """
 
 import numpy as np
@@ -251,7 +252,12 @@ def _camera(mi, rng, half, *, outside: bool) -> dict:
         up=[float(rng.normal() * 0.05), 1, 0],
     )
     # Narrow views show a few things in detail, as a crop of a large film does.
-    return {"type": "perspective", "to_world": look, "fov": float(rng.uniform(16, 60))}
+    camera = {"type": "perspective", "to_world": look, "fov": rng.uniform(16, 60)}
+    if rng.random() < 0.25:  # depth of field
+        far = float(np.linalg.norm(np.subtract(target, origin)))
+        camera |= {"type": "thinlens", "aperture_radius": rng.uniform(0.01, 0.05)}
+        camera |= {"focus_distance": far * rng.uniform(0.6, 1.1)}
+    return camera
 
 
 def _surface(mi, rng, tiles: int = 1) -> dict:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from jscomb.frame import Estimate, Frame, Reference, make_frame
 from jscomb.rendering._launcher import Launcher
 from jscomb.rendering._partial import Partial
-from jscomb.rendering._passes import PHOTONS, Moments, Pass, plan_passes
+from jscomb.rendering._passes import PHOTONS, SAMPLES, Moments, Pass, plan_passes
 from jscomb.rendering._scenes import mitsuba
 from jscomb.rendering._settings import Settings
 
@@ -95,9 +95,9 @@ def render_steps(
         >>> if rendering.available():
         ...     settings = Settings(spp=4, size=8, buffers=1)
         ...     for done, moments in render_steps("cornell-box", settings):
-        ...         if done == 2:
+        ...         if done == 1:
         ...             break
-        ...     assert moments["color0"].number == 2
+        ...     assert moments["color0"].number == 4
     """
     launch = launch or Launcher(scene, settings)
     kept = Partial(partial, scene, settings)
@@ -109,7 +109,11 @@ def render_steps(
         if done:
             yield done, moments
         for number, p in enumerate(todo[done:], done + 1):
-            moments[p.target] = moments.get(p.target, Moments()).add(launch(p))
+            found = moments.get(p.target, Moments())
+            image = launch(p)
+            for each in image if p.integrator == SAMPLES else [image]:
+                found = found.add(each)
+            moments[p.target] = found
             bar.update(p.spp)
             kept.save(number, moments, last=number == len(todo))
             yield number, moments
@@ -144,10 +148,11 @@ def assemble(settings: Settings, moments: Mapping[str, Moments]) -> Frame:
         a, b = moments["reference0"].mean, moments["reference1"].mean
         both = (a + b) / 2, a - b
         reference = Reference(*(jnp.asarray(i, jnp.float32) for i in both))
+    single = settings.spp == settings.buffers
     aov = stack("aov", lambda m: m.mean)
     frame = make_frame(
         stack("color", lambda m: m.mean),
-        variance=stack("color", lambda m: m.variance_of_mean),
+        variance=None if single else stack("color", lambda m: m.variance_of_mean),
         albedo=aov[..., :3].clip(0, 1),  # metals report up to 10
         normal=aov[..., 3:6],
         depth=aov[..., 6:7],

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Literal
 
 REFERENCE_CHUNK = 16  # samples of one reference pass: bounds memory, saves launches
+LARGEST_LAUNCH = 2**19  # single samples that are rendered together; bounds memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +16,8 @@ class Settings:
         size: width and height in pixels; 0 keeps an XML file's own size.
         width: of the film in pixels, where it is not square.
         height: of the film in pixels, where it is not square.
-        buffers: number of independent sub-buffers, 1 or even.
+        buffers: number of independent sub-buffers, 1 or even; with one sample each
+            they have no variance of their own, and the frame's is from their spread.
         feature_spp: samples a pixel of each sub-buffer's features.
         reference_spp: samples a pixel of the reference; 0 renders none.
         numbers: the random numbers of different pixels: independent, or common, the
@@ -57,10 +59,10 @@ class Settings:
         k = self.buffers
         if k < 1 or (k > 1 and k % 2):
             raise ValueError(f"buffers must be 1 or even, got {k}")
-        if self.spp % k or self.spp < 2 * k:
+        if self.spp % k or self.spp < 2:
             raise ValueError(
-                f"spp must be a multiple of buffers = {k} and at least {2 * k} (a "
-                f"variance needs two samples a buffer), got {self.spp}"
+                f"spp must be a multiple of buffers = {k} and at least 2, got "
+                f"{self.spp}"
             )
         if self.reference_spp < 0 or self.reference_spp % (2 * REFERENCE_CHUNK):
             raise ValueError(
@@ -85,3 +87,13 @@ class Settings:
     def film(self) -> tuple[int, int]:
         """Width and height in pixels; 0 for the scene's own."""
         return self.width or self.size, self.height or self.size
+
+    @property
+    def samples_together(self) -> int:
+        """Samples a pixel that one pass renders; a small film's launch is dear."""
+        width, height = self.film
+        if self.numbers == "common" or not (width and height):
+            return 1
+        most = min(REFERENCE_CHUNK, LARGEST_LAUNCH // (width * height))
+        each = self.spp // self.buffers
+        return max((n for n in range(1, most + 1) if each % n == 0), default=1)

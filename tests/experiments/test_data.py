@@ -6,8 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.data import bundle, dataset, development, synthetic
-from experiments.training import train
+from experiments.data import bundle, dataset, development, synthetic, variations
 from jscomb import exr, rendering
 from jscomb.denoisers import oidn
 from tests.statistics import assert_mean
@@ -84,52 +83,96 @@ def test_scenes_are_lit_and_differ(vectorised):
     assert len(set(means)) == 10
 
 
-def test_renders_share_one_reference(tmp_path):
-    config = dataset.Config(tmp_path, scenes=1, counts=3)
-    jobs = list(dataset.jobs(config, 7))
-    assert list(dataset.jobs(config, 7)) == jobs
-    counts = [job.settings.spp for job in jobs]
-    assert counts == sorted(counts, reverse=True)
-    assert set(counts) <= set(dataset.COUNTS)
-    assert len(set(counts)) == 3
-    assert [job.settings.reference_spp for job in jobs] == [1024, 0, 0]
-    assert [job.reference_from for job in jobs] == [None, *[jobs[0].out] * 2]
-    # No stream is used twice: the inputs are independent of the reference.
-    streams = [p.seed for job in jobs for p in rendering.plan_passes(job.settings)]
-    assert len(streams) == len(set(streams))
+def test_splits_share_no_scene(tmp_path):
+    config = dataset.Config(tmp_path, scenes=tmp_path)
+    every = dataset.views(config)
+    assert len(set(every)) == len(every)
+    assert len({view.name for view in every}) == len(every)
+    owners: dict[str, set[str]] = {}
+    for view in every:
+        scene = view.name if view.scene == "random" else view.scene
+        owners.setdefault(scene, set()).add(view.split)
+    assert all(len(splits) == 1 for splits in owners.values())
+    numbers = {view.name: dataset.counts(view) for view in every}
+    assert sum(map(len, numbers.values())) >= 600
+    assert {n for each in numbers.values() for n in each} >= {4, 64, 1024, 4096}
+    assert dataset.counts(every[0]) == dataset.counts(every[0])
 
 
 def test_bad_configurations_of_a_dataset(tmp_path):
-    for wrong in ({"counts": 8}, {"scenes": 0}, {"reference_spp": 512}):
-        with pytest.raises(ValueError, match=r"counts must be|dataset wants"):
-            dataset.Config(tmp_path, **wrong)
+    with pytest.raises(ValueError, match="no split training; there are train, val"):
+        dataset.Config(tmp_path, scenes=tmp_path, splits=("training",))
+    with pytest.raises(ValueError, match="no frames there"):
+        list(dataset.frames(tmp_path, "train"))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 def test_a_dataset_is_made_once(tmp_path, vectorised, capsys):
-    config = dataset.Config(tmp_path, scenes=1, size=16, seed=2)
+    config = dataset.Config(tmp_path, scenes=tmp_path, splits=("train",), quick=True)
     files = dataset.run(config)
-    assert "2 frames, 0 MB; 2 made" in capsys.readouterr().out
+    assert "3 frames made" in capsys.readouterr().out
     frames = [exr.read_frame(file) for file in files]
-    a, b = (frame.reference for frame in frames)
-    np.testing.assert_array_equal(a.image, b.image)
-    assert a.half_difference is not None
     for frame in frames:
-        assert frame.sub_buffers == 2
-        assert frame.estimates["oidn"].halves.shape == (2, 16, 16, 3)
-        assert frame.buffers.variance is not None
+        np.testing.assert_array_equal(frame.reference.image, frames[0].reference.image)
+        assert frame.reference.half_difference is not None
+        assert frame.sub_buffers == 4
+        for name in ("oidn", "photons"):
+            assert frame.estimates[name].halves.shape == (2, 16, 16, 3)
         assert frame.visibility is not None
+    assert np.abs(frames[0].color - frames[1].color).max() > 0
     times = [file.stat().st_mtime_ns for file in files]
     files[1].unlink()
     assert dataset.run(config) == files
-    assert "1 made" in capsys.readouterr().out
+    assert "1 frames made" in capsys.readouterr().out
     assert files[0].stat().st_mtime_ns == times[0]
-    more = dataclasses.replace(config, scenes=2)
-    assert {train.scene_of(f) for f in dataset.run(more)} == {
-        "random-00002",
-        "random-00003",
-    }
+    found = list(dataset.frames(tmp_path, "train"))
+    assert {path for *_, path in found} == set(files)
+    missing = dataclasses.replace(config, quick=False, splits=("test",))
+    with pytest.raises(ValueError, match=r"living-room/scene\.xml: no such file"):
+        dataset.run(missing)
+
+
+ROOM = """<scene version="3.0.0">
+<sensor type="perspective"><float name="fov" value="50"/>
+<transform name="to_world"><lookat origin="0, 0, 3.5" target="0, 0, 0" up="0, 1, 0"/>
+</transform><film type="hdrfilm"/></sensor>
+<bsdf type="twosided" id="Red"><bsdf type="diffuse">
+<rgb name="reflectance" value="0.8 0.1 0.1"/></bsdf></bsdf>
+<bsdf type="twosided" id="Metal"><bsdf type="roughconductor">
+<float name="alpha" value="0.2"/></bsdf></bsdf>
+<shape type="cube"><boolean name="flip_normals" value="true"/>
+<transform name="to_world"><scale value="4"/></transform><ref id="Red"/></shape>
+<shape type="cube"><ref id="Metal"/></shape>
+<shape type="sphere"><point name="center" x="2" y="2" z="2"/>
+<float name="radius" value="0.5"/>
+<emitter type="area"><rgb name="radiance" value="9 9 9"/></emitter></shape>
+</scene>"""
+
+
+def test_variations_of_a_scene(vectorised, tmp_path):
+    """A seed is one variation; cameras, lights and materials differ; all see light."""
+    original = tmp_path / "scene.xml"
+    original.write_text(ROOM)
+    texts = []
+    for seed in (0, 0, 1):
+        out = tmp_path / "out.xml"
+        assert variations.write_variation(original, seed, out)
+        texts.append(out.read_text())
+        scene = rendering.load_scene(str(out), width=24, height=24)
+        image = np.asarray(vectorised.render(scene, spp=16))
+        assert np.median(image) > 0
+    assert texts[0] == texts[1] != texts[2]
+    for changing in ("lookat", "radiance"):
+        first, second = (
+            [line for line in text.split("<") if changing in line] for text in texts[1:]
+        )
+        assert first != second
+    dark = ROOM.replace('value="9 9 9"', 'value="0 0 0"')
+    original.write_text(dark)
+    assert not variations.write_variation(original, 0, tmp_path / "dark.xml")
+    assert not (tmp_path / "dark.xml").exists()
+    assert not list(tmp_path.glob("*.tmp.xml"))
 
 
 @pytest.mark.slow
