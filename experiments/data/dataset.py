@@ -10,10 +10,8 @@ run. `--sheet` prints what is there.
 Splits are by scene: no view of a scene that is trained on is in another split. The test
 split is for final figures only; choices are made on the validation split.
 
-References of training views are noisy. A squared error whose weight does not depend on
-the reference has the gradient of a clean one nevertheless (`learning.losses`); those of
-validation and test views have four times the samples, and `metrics` subtract what noise
-is left.
+References of training views are noisy; those of validation and test views have four
+times the samples, and `metrics.rel_l2` subtracts what noise is left.
 """
 
 import dataclasses
