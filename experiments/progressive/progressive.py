@@ -72,7 +72,7 @@ def stages(config: Config) -> Iterator[Frame]:
     todo, partial = [*before, *color], config.work / "frame.partial.npz"
     steps = rendering.render_steps(config.scene, whole, todo=todo, partial=partial)
     for done, moments in steps:
-        samples = done - len(before)
+        samples = sum(p.spp for p in todo[len(before) : done])
         if samples >= due or samples == config.spp:
             yield rendering.assemble(dataclasses.replace(whole, spp=samples), moments)
             due = 2 * samples
