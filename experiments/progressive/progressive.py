@@ -67,12 +67,13 @@ def stages(config: Config) -> Iterator[Frame]:
     )
     every = rendering.plan_passes(whole)
     before = [p for p in every if p.target != "color0"]
-    color = [p for p in every if p.target == "color0"]
+    # A sample a pass, of streams beyond the others.
+    color = [rendering.Pass("color0", 1, 10**6 + k, "path") for k in range(config.spp)]
     due = config.first
     todo, partial = [*before, *color], config.work / "frame.partial.npz"
     steps = rendering.render_steps(config.scene, whole, todo=todo, partial=partial)
     for done, moments in steps:
-        samples = sum(p.spp for p in todo[len(before) : done])
+        samples = done - len(before)
         if samples >= due or samples == config.spp:
             yield rendering.assemble(dataclasses.replace(whole, spp=samples), moments)
             due = 2 * samples
