@@ -421,7 +421,7 @@ class Pooling(NamedTuple):
     """A network of one parameter, which sees less far than its kernels."""
 
     rate: jax.Array
-    reach, multiple = 1, 1
+    reach, multiple, window = 1, 1, 13
 
     def __call__(self, p, u, b, v, m):
         """Narrower kernels and more confidence where the images differ."""
@@ -429,7 +429,7 @@ class Pooling(NamedTuple):
         features = self.rate * window_mean(differences, width)
         steps = jnp.linspace(0, 1, 2 * 13**2, dtype=features.dtype)
         head = lambda near: jnp.exp(-near * steps[None, None])
-        return double_shrinkage.Filters(Kernels(features, head, 0), features)
+        return double_shrinkage.Filters(Kernels(features, head, 0, 13), features)
 
 
 class Wide(Pooling):
@@ -511,3 +511,49 @@ def test_ugly_frames(glass_frame):
     assert np.isfinite(np.delete(prior.reshape(-1, 3), (1310, 2569), 0)).all()
     np.testing.assert_allclose(found[20, 30], photons.image[20, 30], rtol=1e-6)
     np.testing.assert_allclose(found[40, 9], frame.color[40, 9], rtol=1e-6)
+
+
+def test_dependence_tells_a_denoised_image_from_another_integrators(glass_frame):
+    """By its noise: also where the noise is heavy-tailed and the images are tiny."""
+    a, b = (half.color for half in glass_frame.halves())
+    y = glass_frame.estimates["oidn"].halves
+    assert double_shrinkage.depends(glass_frame, glass_frame.estimates["oidn"])
+    turned = jnp.stack([half[::-1, ::-1] for half in y])  # its noise is another's
+    assert not double_shrinkage.depends(glass_frame, Estimate(turned[0], turned))
+    run = jax.jit(double_shrinkage.dependence)
+    assert run(a, b, *y).correlation > 0.05
+    assert not run(a, b, a, a).certain
+    one = run(a[:1, :1], b[:1, :1], *y[:, :1, :1])
+    assert np.isfinite(one.standard_error)
+    total = lambda *images: double_shrinkage.dependence(*images).correlation
+    for images in ((a, b, *y), (a, a, *y), (a, b, a, a)):
+        for gradient in jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*images):
+            assert np.isfinite(gradient).all()
+
+
+def test_independent_noise_has_no_correlation_in_the_mean():
+    """However heavy its tails; and the standard error is not too small."""
+    keys = jax.random.split(jax.random.key(0), 300)
+
+    def t(key):
+        u, b = jax.random.pareto(key, 1.5, (2, 2, 32, 32, 3))
+        found = double_shrinkage.dependence(*u, *b)
+        return found.correlation / found.standard_error
+
+    found = jax.jit(jax.vmap(t))(keys)
+    assert_mean(found, 0.0)
+    assert 0.5 < float(jnp.std(found)) < 1.1
+
+
+def test_the_wrong_use_of_a_network_warns(glass_frame):
+    frame = glass_frame.normalised()
+    y = frame.estimates["oidn"]
+    network = Pooling(jnp.float32(2.0))
+    network.__class__.serves = "independent"
+    try:
+        with pytest.warns(UserWarning, match="combines independent images"):
+            double_shrinkage.plan_neural(network, frame, y)
+        network.__class__.serves = "denoised"
+        double_shrinkage.plan_neural(network, frame, y)
+    finally:
+        del network.__class__.serves

@@ -213,12 +213,44 @@ def test_risk_is_equation_8_in_every_window():
         np.testing.assert_allclose(estimate[i, j, c], expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("bias", "xi"), [(0.3, 0.0), (0.5, 0.4), (3.0, 1.0)])
+def test_the_bound_of_equation_9_is_one(bias, xi):
+    """The mean error of the rule is below it, and it is below the error of x.
+
+    By how much, exactly: the bound by Jensen's inequality is that of the rule without
+    the positive part, whose expectation is 1 / the mean of a non-central chi-square.
+    """
+    sigma, p = 0.5, 49
+    full = lambda value: jnp.full(ONE_WINDOW, value)
+    bound = james_stein.risk_bound(full(bias), full(xi**2), full(sigma**2))[3, 3, 0]
+    energy = p * (bias**2 + xi**2 + sigma**2)
+    expected = p * sigma**2 - (p - 2) ** 2 * sigma**4 / energy
+    np.testing.assert_allclose(bound, expected, rtol=1e-12)
+    assert bound < p * sigma**2
+
+    def error(key):
+        one, other = jax.random.split(key)
+        x = sigma * jax.random.normal(one, ONE_WINDOW)
+        y = bias + xi * jax.random.normal(other, ONE_WINDOW)
+        out = james_stein.combine(x, y, full(sigma**2), window=15)
+        return jnp.sum(jnp.square(out))
+
+    keys = jax.random.split(jax.random.key(5), REALISATIONS)
+    errors = np.asarray(jax.jit(jax.vmap(error))(keys))
+    # Where y is far off the bound is the error itself.
+    assert errors.mean() - 5 * errors.std() / len(errors) ** 0.5 < bound
+    assert errors.mean() > 0.5 * bound
+
+
 def test_dual_is_the_mean_of_the_crossed_halves():
     xa, ya, v = images((6, 5, 2), 1)
     xb, yb, _ = images((6, 5, 2), 2)
     out = james_stein.combine_dual(xa, xb, ya, yb, v, window=3)
     a, b = oracle(xa, yb, 2 * v, 3, False), oracle(xb, ya, 2 * v, 3, False)
     np.testing.assert_allclose(out, (a + b) / 2, rtol=1e-12)
+    share = jnp.linspace(0, 1, 30).reshape(6, 5, 1)
+    out = james_stein.combine_dual(xa, xb, ya, yb, v, window=3, share=share)
+    np.testing.assert_allclose(out, share * a + (1 - share) * b, rtol=1e-12)
 
 
 def test_dual_dominates_a_denoiser_that_overfits():

@@ -10,9 +10,9 @@ from jscomb.numerics.kernels import Kernels, kernel_mean, predicted_mean
 from jscomb.numerics.tiles import map_rows
 
 
-def identity(weights, reach=1):
+def identity(weights, window, reach=1):
     """Kernels whose head returns its features, less the rows around the strip."""
-    return Kernels(weights, lambda f: f[reach : f.shape[0] - reach], reach)
+    return Kernels(weights, lambda f: f[reach : f.shape[0] - reach], reach, window)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (16, 4), (37, 9)])
@@ -28,7 +28,7 @@ def test_predicted_is_given_a_strip_at_a_time(shape, reach, rng):
             kernel_mean(image, half, 5, mask=mask)
             for image, half in zip(images, jnp.split(weights, 2, axis=-1), strict=True)
         ]
-        return predicted_mean(images, identity(weights, reach), 5, mask=mask), at_once
+        return predicted_mean(images, identity(weights, 5, reach), mask=mask), at_once
 
     for found, expected in zip(*both(images, weights, mask), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-12)
@@ -36,7 +36,7 @@ def test_predicted_is_given_a_strip_at_a_time(shape, reach, rng):
 
 def test_predicted_differentiates_in_both_modes(rng):
     images, weights = jnp.asarray(rng.random((1, 20, 4, 2))), rng.random((20, 4, 9))
-    mean = lambda i, w: predicted_mean(i, identity(w), 3)
+    mean = lambda i, w: predicted_mean(i, identity(w, 3))
     check_grads(jax.jit(mean), (images, jnp.asarray(weights)), order=1)
 
 
@@ -46,7 +46,7 @@ def test_masked_pixels_are_excluded(rng):
         jnp.asarray(rng.random((20, 4, 9))),
         jnp.isfinite(images[0, ..., :1]),
     )
-    total = lambda i, w: predicted_mean(i, identity(w), 3, mask=mask).sum()
+    total = lambda i, w: predicted_mean(i, identity(w, 3), mask=mask).sum()
     run = jax.jit(jax.value_and_grad(total, (0, 1)))
     value, gradients = run(images, weights)
     assert np.isfinite(value)
@@ -56,7 +56,7 @@ def test_masked_pixels_are_excluded(rng):
 
 def test_the_number_of_weights_must_fit(unchecked):
     with pytest.raises(ValueError, match="need 50 weights a pixel, got 25"):
-        predicted_mean(jnp.ones((2, 4, 4, 1)), identity(jnp.ones((4, 4, 25))), 5)
+        predicted_mean(jnp.ones((2, 4, 4, 1)), identity(jnp.ones((4, 4, 25)), 5))
 
 
 def test_memory_does_not_hold_all_weights():
@@ -65,7 +65,7 @@ def test_memory_does_not_hold_all_weights():
     kernel = jnp.ones((32, 225), jnp.float32)
     features = jax.ShapeDtypeStruct((size, size, 32), jnp.float32)
     image = jax.ShapeDtypeStruct((1, size, size, 3), jnp.float32)
-    mean = lambda f, i: predicted_mean(i, Kernels(f, lambda f: f @ kernel, 0), 15)
+    mean = lambda f, i: predicted_mean(i, Kernels(f, lambda f: f @ kernel, 0, 15))
     memory = jax.jit(mean).lower(features, image).compile().memory_analysis()
     assert memory.temp_size_in_bytes / size**2 < 400
     gradient = jax.jit(jax.grad(lambda f, i: mean(f, i).sum()))

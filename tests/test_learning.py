@@ -14,7 +14,7 @@ from jscomb import exr
 from jscomb.denoisers import kernel_predicting, oidn
 from jscomb.learning import checkpoints, losses, networks, recipes, training
 from jscomb.learning.recipes import RECIPES
-from jscomb.metrics import rel_l2
+from jscomb.metrics import rel_l2, smape
 from tests.statistics import assert_mean
 
 DATA = pathlib.Path(__file__).parent / "data"
@@ -27,41 +27,61 @@ def examples(rng):
     """Three frames of noise; inputs are the reference, and in a variant its half."""
     reference = jnp.asarray(rng.random((3, 12, 14, 3)), jnp.float32)
     both = jnp.stack([reference, reference / 2], axis=1)
-    return training.Examples({"full": both, "one": both[..., :1]}, reference)
+    halves = jnp.stack([reference, 3 * reference], axis=1)
+    weight = jnp.array([1.0, 2.0, 4.0], jnp.float32)
+    return training.Examples({"full": both, "one": both[..., :1]}, halves, weight)
 
 
 def test_draw_keeps_images_together(examples):
-    """Inputs and reference are cut, flipped and coloured alike; the unit differs."""
-    variants = set()
+    """Inputs and halves are cut, flipped and coloured alike; the unit differs."""
+    variants, weights = set(), set()
     for key in jax.random.split(jax.random.key(0), 20):
-        inputs, reference, unit = training.draw(key, examples, SCHEDULE)
+        crop = training.draw(key, examples, SCHEDULE)
+        reference, other = crop.halves
         assert reference.shape == (8, 8, 3)
-        share = float(inputs["full"][0, 0, 0] / reference[0, 0, 0])
-        np.testing.assert_allclose(inputs["full"], share * reference, rtol=1e-6)
-        assert inputs["one"].shape == (8, 8, 1)
-        assert 0.5 <= float(unit) <= 2
+        np.testing.assert_array_equal(other, 3 * reference)
+        share = float(crop.inputs["full"][0, 0, 0] / reference[0, 0, 0])
+        np.testing.assert_allclose(crop.inputs["full"], share * reference, rtol=1e-6)
+        assert crop.inputs["one"].shape == (8, 8, 1)
+        assert 0.5 <= float(crop.unit) <= 2
         variants.add(share)
-        # Its pixels are those of one of the frames, up to the order of channels.
-        pixels = np.sort(np.asarray(examples.reference).reshape(-1, 3), axis=-1)
+        # Its pixels are those of the frame whose weight it has, up to their channels.
+        weights.add(float(crop.weight))
+        frame = examples.halves[int(np.log2(crop.weight)), 0]
+        pixels = np.sort(np.asarray(frame).reshape(-1, 3), axis=-1)
         found = np.sort(np.asarray(reference).reshape(-1, 3), axis=-1)
         assert {tuple(p) for p in found} <= {tuple(p) for p in pixels}
     assert variants == {0.5, 1.0}
+    assert weights == {1.0, 2.0, 4.0}
 
 
 def test_every_pixel_is_drawn_equally_often(examples):
     """The mean over draws is the mean over all possible crops."""
     keys = jax.random.split(jax.random.key(1), 4000)
     whole = dataclasses.replace(SCHEDULE, crop=12)
-    drawn = jax.vmap(lambda key: training.draw(key, examples, whole)[1].mean())(keys)
-    crops = [examples.reference[:, :, c : c + 12] for c in range(3)]
-    assert_mean(drawn, float(jnp.stack(crops).mean()))
+    mean = lambda key: training.draw(key, examples, whole).halves[0].mean()
+    crops = [examples.halves[:, 0, :, c : c + 12] for c in range(3)]
+    assert_mean(jax.vmap(mean)(keys), float(jnp.stack(crops).mean()))
+
+
+def test_a_frames_loss_has_its_weight(examples):
+    """The first step's loss is the mean over crops of weight times loss."""
+    objective = lambda network, inputs, halves, unit: (
+        network * jnp.mean(halves[0]) / unit
+    )
+    state = training.start(jnp.float32(1.5), SCHEDULE)
+    _, value = next(training.run(objective, state, examples, SCHEDULE))
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(0), 0), SCHEDULE.batch)
+    drawn = [training.draw(key, examples, SCHEDULE) for key in keys]
+    wanted = [1.5 * c.weight * c.halves[0].mean() / c.unit for c in drawn]
+    np.testing.assert_allclose(value, np.mean(wanted), rtol=1e-5)
 
 
 def fit(examples, steps):
     """Return an objective, its network, and a run that learns a factor."""
 
-    def objective(network, inputs, reference, unit):
-        return jnp.mean(jnp.square(network["scale"] * inputs["full"] - reference))
+    def objective(network, inputs, halves, unit):
+        return jnp.mean(jnp.square(network["scale"] * inputs["full"] - halves[0]))
 
     network = {"scale": jnp.ones((), jnp.float32)}
     state = training.start(network, SCHEDULE)
@@ -89,11 +109,11 @@ def test_crops_must_fit(examples):
 
 
 def test_evaluate_takes_the_first_variant(examples):
-    objective = lambda network, inputs, reference, unit: jnp.mean(
-        jnp.square(network * inputs["full"] - reference) * unit
+    objective = lambda network, inputs, halves, unit: jnp.mean(
+        jnp.square(network * inputs["full"] - halves[0]) * unit
     )
     found = training.evaluate(objective, jnp.float32(2), examples)
-    wanted = np.square(np.asarray(examples.reference)).mean((1, 2, 3))
+    wanted = np.square(np.asarray(examples.halves[:, 0])).mean((1, 2, 3))
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
@@ -109,13 +129,48 @@ def test_log_l2_matches_its_equation(rng):
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
-def test_a_noisy_reference_does_not_bias_a_squared_loss(rng):
-    """The gradient's mean over noisy references is that of the true one."""
-    image, truth = jnp.asarray(rng.random((2, 6, 6, 3)))
-    loss = lambda scale, r: jnp.mean(jnp.square(scale * image - r))
-    noise = jax.random.exponential(jax.random.key(0), (4000, 6, 6, 3)) - 1
-    gradients = jax.vmap(lambda e: jax.grad(loss)(1.5, truth + e))(noise)
-    assert_mean(gradients, float(jax.grad(loss)(1.5, truth)))
+def test_relative_l2_matches_its_equation(rng):
+    """Each half is the target, with the weight of the other."""
+    image, a, b = rng.random((3, 5, 6, 3)) * 3 - 0.5
+    wanted = 0
+    for i, j in np.ndindex(5, 6):
+        for target, other in ((a, b), (b, a)):
+            weight = 1 / (other[i, j].mean() ** 2 + 0.01)
+            wanted += ((image[i, j] - target[i, j]) ** 2).mean() * weight / 60
+    halves = jnp.asarray(np.stack([a, b]))
+    found = losses.relative_l2(jnp.asarray(image), halves)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
+LOSSES = {
+    "relative L2 of halves": (losses.relative_l2, True),
+    "relative L2 of their mean": (recipes.of_mean(rel_l2), False),
+    "log-L2": (recipes.of_mean(losses.log_l2), False),
+    "SMAPE": (recipes.of_mean(smape), False),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_what_a_noisy_reference_does_to_a_loss(name, rng):
+    """Where the gradient vanishes with clean references, does it with noisy ones?
+
+    The image is a multiple of the truth, and the loss that of the multiple: its minimum
+    is at one. The weights of a noisy reference's own radiance, logarithms and absolute
+    values move it; halves that weight each other do not.
+    """
+    loss, unbiased = LOSSES[name]
+    truth = jnp.asarray(rng.random((6, 6, 3)))
+    of_scale = lambda scale, halves: loss(scale * truth, halves)
+    noise = jax.random.exponential(jax.random.key(0), (4000, 2, 6, 6, 3)) - 1
+    noisy = lambda e: truth[None] + 0.7 * e
+    slope = jax.jit(jax.vmap(lambda e: jax.grad(of_scale)(1.0, noisy(e))))
+    if unbiased:
+        assert_mean(slope(noise), 0.0)
+        # Elsewhere it points to the minimum.
+        assert jax.grad(of_scale)(1.5, noisy(noise[0])) > 0
+    else:
+        with pytest.raises(AssertionError):
+            assert_mean(slope(noise), 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +178,7 @@ def saved(tmp_path_factory):
     """A light mixing network as its file and card."""
     path = tmp_path_factory.mktemp("network") / "pd.safetensors"
     checkpoints.save(path, networks.MixingNetwork(jax.random.key(0), size="light"))
-    path.with_suffix(".json").write_text('{"size": "light"}')
+    path.with_suffix(".json").write_text('{"network": {"size": "light"}}')
     return path
 
 
@@ -159,7 +214,7 @@ def test_files_that_do_not_fit_are_rejected(saved, tmp_path, harm, message):
     elif harm == "no card":
         card.unlink()
     elif harm == "size":
-        card.write_text('{"size": "full"}')
+        card.write_text('{"network": {"size": "full"}}')
     with pytest.raises(ValueError, match=message) as error:
         recipes.load_network(RECIPES["njs" if harm == "other" else "pd"], path)
     assert str(tmp_path) in str(error.value)
@@ -167,9 +222,9 @@ def test_files_that_do_not_fit_are_rejected(saved, tmp_path, harm, message):
 
 
 def test_unknown_network():
-    with pytest.raises(ValueError, match="network 'gan'; there are njs, dsc, pd"):
+    with pytest.raises(ValueError, match="network 'gan'; there are dsc, njs, pd"):
         recipes.shipped("gan")
-    with pytest.raises(ValueError, match="network 'kernels'; there are njs, dsc, pd"):
+    with pytest.raises(ValueError, match="network 'kernels'; there are dsc, njs, pd"):
         recipes.shipped("kernels")
 
 
@@ -207,8 +262,8 @@ def test_shipped_networks_help(name, glass_frame):
     assert found < noisy / 2
     assert found < 1.1 * denoised
     many = exr.read_frame(DATA / "cornell-glass-1024.exr")
-    size = json.loads((recipes.WEIGHTS / f"{name}.json").read_text())["size"]
-    untrained = recipe.network(jax.random.key(0), size=size)
+    card = recipes.read_card(recipes.WEIGHTS / f"{name}.safetensors")
+    untrained = recipe.make(jax.random.key(0), **recipes.options_of(card))
     assert errors(many, network)[-1] < 0.97 * errors(many, untrained)[-1]
 
 
@@ -227,7 +282,7 @@ INPUTS = {
 @pytest.mark.parametrize("name", INPUTS)
 def test_a_unit_undoes_the_brightness_of_a_scene(name, rng):
     recipe, unit = RECIPES[name], jnp.asarray(3.0)
-    network = recipe.network(jax.random.key(0), size="light")
+    network = recipe.make(jax.random.key(0), size="light")
     inputs, bright = {}, {}
     for key, (channels, power) in INPUTS[name].items():
         inputs[key] = jnp.asarray(rng.random((9, 10, channels)))

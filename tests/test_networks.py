@@ -1,5 +1,7 @@
 """Networks: convolutions, sizes, reach, and the combiners that use them."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -196,11 +198,11 @@ def test_sizes_are_the_papers():
         assert full / 4 < light < full / 3
 
 
-def stub_kernels(weights):
+def stub_kernels(weights, window):
     """Return a network with the same weights at every pixel."""
     shape = lambda f: (*f.shape[:2], len(weights))
     head = lambda f: jnp.broadcast_to(jnp.asarray(weights, f.dtype), shape(f))
-    return lambda image: Kernels(image, head, 0)
+    return lambda image: Kernels(image, head, 0, window)
 
 
 @pytest.fixture
@@ -213,7 +215,7 @@ def images(glass_frame):
 
 def test_equal_weights_are_the_estimator_without_a_network(images):
     x, _, a, b, v = images
-    equal = stub_kernels(np.ones(225))
+    equal = stub_kernels(np.ones(225), 15)
 
     def network(x, v, a, b):
         return james_stein.Parameters(equal(x), jnp.full_like(x[..., :1], 0.25))
@@ -228,12 +230,31 @@ def test_equal_weights_are_the_estimator_without_a_network(images):
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
+def test_the_dual_form_blends_the_crossed_halves_by_the_networks_share(images):
+    x, _, a, b, v = images
+    x_b = 1.1 * x[::-1]
+    equal = stub_kernels(np.ones(225), 15)
+    network = lambda x, v, a, b: james_stein.Parameters(
+        equal(x), jnp.full_like(x[..., :1], 0.25)
+    )
+
+    @jax.jit
+    def both(x_a, x_b, a, b, v):
+        pooled = james_stein.smooth_variance(v, window=15)
+        wanted = james_stein.combine_dual(x_a, x_b, a, b, pooled, share=0.25)
+        dual = james_stein.neural_combine_dual
+        return dual(network, x_a, x_b, a, b, v), wanted
+
+    found, wanted = both(x, x_b, a, b, v)
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+
+
 def test_unit_kernels_are_double_shrinkage_of_single_pixels(images):
     x, y, p, _, v = images
     one, eta = v.mean(-1, keepdims=True), jnp.full_like(v[..., :1], 0.3)
     delta = np.zeros(169)
     delta[84] = 1
-    both = stub_kernels(np.concatenate([delta, delta]))
+    both = stub_kernels(np.concatenate([delta, delta]), 13)
 
     def network(p, u, b, v, m):
         return double_shrinkage.Filters(both(u), eta)
@@ -270,13 +291,8 @@ NETWORKS = {
         lambda n, x, y, v: progressive.neural_combine(n, x, y, v, v / 2),
     ),
     "pd, direct": (
-        networks.MixingNetwork,
-        lambda n, x, y, v: progressive.neural_combine(
-            n,
-            *(x, y, v, v / 2),
-            activate=progressive.direct_activation,
-            bound=False,
-        ),
+        functools.partial(networks.MixingNetwork, form="direct"),
+        lambda n, x, y, v: progressive.neural_combine(n, x, y, v, v / 2, bound=False),
     ),
     "kernels": (
         networks.KernelPredictor,

@@ -132,15 +132,58 @@ def test_the_bound_is_consistent(bias, rng):
         assert min(shares) > 0.95
 
 
+def test_the_variance_of_the_channels_mean(rng):
+    """Right for independent channels, for grey noise, and in between."""
+    shape = 2, 64, 64, 3
+    own, grey = rng.normal(size=shape), rng.normal(size=(*shape[:3], 1))
+    for part in (0.0, 0.6, 1.0):
+        noise = jnp.asarray((1 - part**2) ** 0.5 * own + part * grey)
+        v = jnp.full(shape[1:], 0.5)  # of the mean of two of variance one
+        found = progressive.channel_variance(*noise, v)
+        expected = 0.5 * ((1 - part**2) / 3 + part**2)
+        np.testing.assert_allclose(found.mean(), expected, rtol=0.05)
+    same = progressive.channel_variance(X, X, V)  # no difference to learn from
+    np.testing.assert_allclose(same, V.mean(-1, keepdims=True), rtol=1e-12)
+
+
+def test_the_bound_knows_correlated_channels(rng):
+    """What grey noise explains is not bounded; by the paper's third it would be."""
+    variance, shape = 1e-4, (32, 32, 3)
+    grey = 1 + variance**0.5 * jnp.asarray(rng.normal(size=(2, 32, 32, 1)))
+    x, y = (
+        jnp.broadcast_to(i, shape) for i in (grey[0], grey[0].mean()[None, None, None])
+    )
+    v, one = jnp.full(shape, variance), jnp.ones(shape)
+    noise = v[..., :1]
+    known = bound_mixing(one, x, y, v, noise=noise)
+    assert known.mean() > 0.95
+    assert bound_mixing(one, x, y, v).mean() < known.mean()
+
+
+def test_the_bound_of_crops_is_that_of_the_image(rng):
+    """With the image's sigma."""
+    alpha = jnp.asarray(rng.uniform(size=(24, 13, 3)))
+    x, y = (jnp.asarray(i) for i in rng.uniform(0.5, 1.5, (2, 24, 13, 3)))
+    v = jnp.asarray(rng.uniform(1e-5, 1e-2, (24, 13, 3)))
+    whole = bound_mixing(alpha, x, y, v, window=5)
+    sigma = progressive.bound_sigma(x, v)
+    crop = bound_mixing(*(i[:16] for i in (alpha, x, y, v)), sigma=sigma, window=5)
+    np.testing.assert_allclose(crop[:13], whole[:13], rtol=1e-12)
+
+
 def test_activation(rng):
     outputs = jnp.asarray(rng.normal(size=(3, 4, 3, 2)))
     found = progressive.activation(outputs)
     one, two, three = np.moveaxis(np.asarray(outputs), 2, 0)
     expected = np.clip((one - two) / np.maximum(three, 1e-6), 0, 1)
     np.testing.assert_allclose(found, expected)
+    free = progressive.activation(outputs, limit=False)
+    np.testing.assert_allclose(free, (one - two) / np.maximum(three, 1e-6))
     direct = progressive.direct_activation(outputs)
     share = 1 / (1 + np.exp(-one))
     np.testing.assert_allclose(direct, np.clip(1.04 * share - 0.02, 0, 1))
+    smooth = progressive.direct_activation(outputs, limit=False)
+    np.testing.assert_allclose(smooth, share)
     ends = jnp.array([-9.0, 9.0]).reshape(1, 2, 1, 1) + jnp.zeros((1, 2, 3, 1))
     np.testing.assert_array_equal(progressive.direct_activation(ends).ravel(), [0, 1])
 

@@ -11,7 +11,7 @@ Splits are by scene: no view of a scene that is trained on is in another split. 
 split is for final figures only; choices are made on the validation split.
 
 References of training views are noisy; those of validation and test views have four
-times the samples, and `metrics.rel_l2` subtracts what noise is left.
+times the samples, and `metrics.rel_l2` subtracts the noise that is left.
 """
 
 import dataclasses
@@ -39,9 +39,9 @@ BUFFERS = 4
 STREAMS = 1_000_000  # difference of the seeds of one view's frames
 VIEWS_A_PROCESS = 8
 PHOTONS_A_PASS = 100_000
-PASSES = (8, 16, 32, 64)  # of photon mapping
+PASSES = (8, 16, 32)  # of photon mapping
 LOW, MIDDLE, HIGH = (4, 8, 16), (32, 64, 128), (256, 512, 1024, 2048, 4096)
-RARE = (0.35, 0.3, 0.2, 0.1, 0.05)  # probabilities of HIGH: cost grows with samples
+RARE = (0.5, 0.25, 0.15, 0.07, 0.03)  # probabilities of HIGH: cost grows with samples
 
 
 class Split(NamedTuple):
@@ -70,22 +70,22 @@ SPLITS = {
         variations=17,
         random=96,
         first=1000,
-        reference_spp=1024,
+        reference_spp=512,
     ),
     "validate": Split(
         ("dining-room", "veach-mis"),
-        variations=5,
-        random=10,
+        variations=3,
+        random=6,
         first=2000,
-        reference_spp=4096,
+        reference_spp=2048,
         counts=(8, 32, 128, 512),
     ),
     "test": Split(
         ("living-room", "staircase2", "veach-bidir"),
-        variations=5,
-        random=12,
+        variations=4,
+        random=8,
         first=3000,
-        reference_spp=4096,
+        reference_spp=2048,
         counts=(4, 16, 64, 256, 1024),
     ),
 }
@@ -98,7 +98,7 @@ class Config:
     Attributes:
         out: folder of the frames.
         scenes: folder of the real scenes, a folder with a scene.xml each.
-        splits: which of the splits, in order.
+        splits: which of the splits.
         size: width and height in pixels.
         sheet: print what is there and render nothing.
         quick: one random scene a split, tiny.
@@ -106,7 +106,7 @@ class Config:
 
     out: tyro.conf.Positional[pathlib.Path]
     scenes: pathlib.Path
-    splits: tuple[str, ...] = ("validate", "train", "test")
+    splits: tuple[str, ...] = ("train", "validate", "test")
     size: int = 128
     sheet: bool = False
     quick: bool = False
@@ -139,7 +139,7 @@ class View(NamedTuple):
 
 
 def views(config: Config) -> list[View]:
-    """List the views, those of all scenes in turn, so that any part is varied.
+    """List the views, those of all splits and scenes in turn: any part is a dataset.
 
     Args:
         config: which splits.
@@ -147,21 +147,18 @@ def views(config: Config) -> list[View]:
     Returns:
         the views.
     """
-    found = []
+    rows = []
     for name in config.splits:
         split = SPLITS[name]
         if config.quick:
             split = split._replace(scenes=(), random=1)
-        rows = [
+        real = [
             [View(name, s, k) for k in range(split.variations)] for s in split.scenes
         ]
-        rows += [[View(name, "random", split.first + k) for k in range(split.random)]]
-        longest = max(map(len, rows))
-        spread = [
-            (k * longest / len(row), view) for row in rows for k, view in enumerate(row)
-        ]
-        found.append([view for _, view in sorted(spread)])
-    return [view for split in found for view in split]
+        random = [View(name, "random", split.first + k) for k in range(split.random)]
+        rows += [*real, random]
+    spread = [(k / len(row), view) for row in rows for k, view in enumerate(row)]
+    return [view for _, view in sorted(spread)]
 
 
 def counts(view: View) -> list[int]:

@@ -120,7 +120,7 @@ def run(config: Config) -> dict[str, Cost]:
     for method in _INPUTS:
         recipe, inputs = RECIPES[method], inputs_of(method, size)
         for kind in ("light",) if config.quick else ("light", "full"):
-            network, name = recipe.network(jax.random.key(3), size=kind), method + " "
+            network, name = recipe.make(jax.random.key(3), size=kind), method + " "
             name += kind
             compiled = jax.jit(recipe.combine).lower(network, inputs).compile()
             used = compiled.memory_analysis().temp_size_in_bytes

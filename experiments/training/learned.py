@@ -1,35 +1,37 @@
-"""Do trained networks beat the estimators without, on scenes unseen in training?
+"""Do trained networks beat themselves untrained, and the forms without a network?
 
-Every archive in the folder (`archives`), at every sample count: relative L2, less the
-reference's noise, of both inputs, of the estimators without a network, and of the
-networks: those that come with the package, or each run of `training.train` in RUNS by
-the name of its folder. Untrained is the same network as training starts from.
+On every frame of a split of `experiments.data.dataset` that took no part in training:
+relative L2, less the reference's noise, of the inputs, of each network, of the same
+network with the parameters that its training began with, and of the estimator without
+a network on the same inputs. Networks are those that come with the package, or of each
+run of `training.train` in RUNS by the name of its folder.
 """
 
 import dataclasses
 import functools
-import json
 import pathlib
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import tyro
 from matplotlib.figure import Figure
 
-from experiments.common import archives, errors
+from experiments.common import errors
 from experiments.common.command import Options, main
 from experiments.common.report import Report
+from experiments.common.results import Results
 from experiments.common.tables import table
-from experiments.training import train
-from jscomb import double_shrinkage, james_stein, progressive
-from jscomb.frame import Frame
-from jscomb.learning import networks, recipes
-from jscomb.learning.recipes import RECIPES
+from experiments.data import dataset
+from experiments.training.train import ALL
+from jscomb import double_shrinkage, exr, james_stein, progressive
+from jscomb.learning import recipes
+from jscomb.learning.examples import draw_losses
 from jscomb.typing import Image
 
-INPUTS = ("path tracing", "oidn")
+TRAINED, UNTRAINED, WITHOUT = "trained", "untrained", "without a network"
+GAIN, MARGIN, WORST = 0.9, 0.95, 1.05  # what a network that ships has to reach
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,59 +39,45 @@ class Config(Options):
     """What to measure.
 
     Attributes:
-        folder: of NumPy archives.
+        folder: of `experiments.data.dataset`.
         runs: folder of runs; None for the shipped networks.
+        split: test, or validate for choices.
         results: file that stores results as they come.
     """
 
     folder: tyro.conf.Positional[pathlib.Path]
     runs: pathlib.Path | None = None
+    split: str = "test"
     results: pathlib.Path | None = None
 
 
-def _errors(images: dict[str, Image], frame: Frame) -> dict[str, float]:
-    """Return the relative L2 of each."""
-    return {name: errors.relative_l2(image, frame) for name, image in images.items()}
+def _james_stein(inputs: Mapping[str, Image]) -> Image:
+    """Whitened, with robust variances, on the same (regressed) image."""
+    y = (inputs["biased_a"] + inputs["biased_b"]) / 2
+    v = james_stein.robust_variance(inputs["variance"])
+    return james_stein.combine(inputs["unbiased"], y, v, window=7, whiten=True)
 
 
-def measure_inputs(frame: Frame) -> dict[str, float]:
-    """Return errors of the inputs, and of combinations without a network.
+def _double_shrinkage(inputs: Mapping[str, Image]) -> Image:
+    """With the errors as they are, and the confidence that they give."""
+    p, u, b = (inputs[name] for name in ("prior", "unbiased", "biased"))
+    v, m = (jnp.broadcast_to(inputs[name], u.shape) for name in ("variance", "mse"))
+    eta = double_shrinkage.confidence(p, u, b, v, m)
+    return double_shrinkage.combine(p, u, b, v, m, eta)
 
-    Args:
-        frame: with the estimate "oidn", its halves and a reference.
 
-    Returns:
-        relative L2 by name.
-    """
-    frame = frame.normalised()
-    oidn = frame.estimates["oidn"]
-    x, y, v = frame.color, oidn.image, frame.variance
-    pooled, robust = james_stein.smooth_variance(v), james_stein.robust_variance(v)
-    images = {"path tracing": x, "oidn": y}
-    images["james-stein"] = james_stein.combine(x, y, pooled)
-    images["whitened"] = james_stein.combine(x, y, robust, window=7, whiten=True)
-    regressed, _ = _james_stein_inputs(frame)
-    star = (regressed["biased_a"] + regressed["biased_b"]) / 2
-    images["y*"] = star
-    images["james-stein, y*"] = james_stein.combine(x, star, pooled)
-    shrunk = double_shrinkage.combine_frame(frame, oidn, stride=2)
-    prior = double_shrinkage.neural_inputs(frame, oidn, stride=2)["prior"]
-    images |= {"double shrinkage": shrunk.image, "its prior": prior}
-    pd = RECIPES["pd"].inputs(jax.random.key(0), frame, oidn)
+def _progressive(inputs: Mapping[str, Image]) -> Image:
+    """By SURE over windows, whitened."""
     mix = functools.partial(progressive.mixing, whiten=True)
-    images["progressive, whitened"] = progressive.combine(**pd, mix=mix)
-    return _errors(images, frame)
+    return progressive.combine(**inputs, mix=mix)
 
 
-def _james_stein_inputs(frame: Frame) -> list[dict[str, Image]]:
-    """Return NJS's inputs with the regressed image, then those with the plain one."""
-    estimate = frame.estimates["oidn"]
-    both = [
-        james_stein.neural_inputs(jax.random.key(0), frame, estimate, choose=choose)
-        for choose in ("helps", "opposite")
-    ]
-    plain = lambda inputs: bool(jnp.all(inputs["biased_a"] == inputs["biased_b"]))
-    return sorted(both, key=plain)
+WITHOUT_NETWORK: dict[str, Callable[[Mapping[str, Image]], Image]] = {
+    "njs": _james_stein,
+    "dsc": _double_shrinkage,
+    "pd": _progressive,
+}
+"""By the first word of a method's name."""
 
 
 class Trained(NamedTuple):
@@ -100,86 +88,90 @@ class Trained(NamedTuple):
     untrained: recipes.Network
 
 
-def measure_network(frame: Frame, of: Trained) -> dict[str, float]:
-    """Return errors of a network's combination, and of variants of it.
+def load(path: pathlib.Path) -> Trained:
+    """Return the network of a file, and itself untrained.
 
     Args:
-        frame: with the estimate "oidn", its halves and a reference.
-        of: the network; its method is a key of `train.ALL`.
+        path: safetensors file beside its card.
 
     Returns:
-        relative L2 by the variant's name, after a comma; "" for none.
+        both.
     """
-    method, network, _ = of
-    frame, recipe = frame.normalised(), train.ALL[method]
-    combine_with = jax.jit(recipe.combine)
-    combine = functools.partial(combine_with, network)
-    inputs = recipe.inputs(jax.random.key(0), frame, frame.estimates["oidn"])
-    images = {"": combine(inputs), ", untrained": combine_with(of.untrained, inputs)}
-    if method.startswith("njs"):
-        regressed, plain = map(combine, _james_stein_inputs(frame))
-        images |= {", always regressed": regressed, ", never regressed": plain}
-    if method.startswith("pd"):
-        direct = (
-            progressive.direct_activation if method == "pd" else progressive.activation
-        )
-        for name, bound in ((", bound", True), (", no bound", False)):
-            variant = functools.partial(
-                progressive.combine_inputs, activate=direct, bound=bound
-            )
-            images[name] = jax.jit(variant)(network, inputs)
-    if method == "kernels-njs":
-        images[", its denoiser"] = RECIPES["kernels"].combine(network.denoiser, inputs)
-    return _errors(images, frame)
+    card = recipes.read_card(path)
+    recipe, seed = ALL[card["method"]], card["schedule"]["seed"]
+    network = recipes.load_network(recipe, path)
+    options = recipes.options_of(card)
+    untrained = recipe.make(jax.random.key(seed), **options)
+    return Trained(card["method"], network, untrained)
 
 
-def networks_of(runs: pathlib.Path | None) -> dict[str, Trained]:
+def networks_of(folder: pathlib.Path | None) -> dict[str, Trained]:
     """Return the networks to measure by name.
 
     Args:
-        runs: folder of runs; None for the shipped networks.
+        folder: of runs; None for the shipped networks.
 
     Returns:
-        those of finished runs.
+        the networks.
     """
-    if runs is None:
-        files = [recipes.WEIGHTS / f"{name}.json" for name in RECIPES]
-        return {file.stem: _trained(file) for file in files if file.exists()}
-    found = {}
-    for card in sorted(runs.glob("*/network.json")):
-        about = json.loads(card.read_text())
-        if about["steps"] == about["schedule"]["steps"]:
-            found[card.parent.name] = _trained(card)
-    return found | _separate(found)
+    if folder is None:
+        found = sorted(recipes.WEIGHTS.glob("*.safetensors"))
+        return {file.stem: load(file) for file in found}
+    found = sorted(folder.glob("*/network.safetensors"))
+    return {file.parent.name: load(file) for file in found}
 
 
-def _trained(card: pathlib.Path) -> Trained:
-    """Return the network of a card."""
-    about = json.loads(card.read_text())
-    recipe, seed = train.ALL[about["method"]], about["schedule"]["seed"]
-    network = recipes.load_network(recipe, card.with_suffix(".safetensors"))
-    untrained = recipe.network(jax.random.key(seed), size=about["size"])
-    return Trained(about["method"], network, untrained)
+def measure(path: pathlib.Path, trained: Mapping[str, Trained]) -> dict[str, float]:
+    """Return the errors of a frame's images.
+
+    Args:
+        path: of the frame.
+        trained: networks by name.
+
+    Returns:
+        relative L2 of "path tracing" and the frame's estimates, and of "NAME, KIND" for
+        each network and kind, at least a fiftieth of the better input's.
+    """
+    frame = exr.read_frame(path).normalised()
+    images = {"path tracing": frame.color}
+    images |= {name: each.image for name, each in frame.estimates.items()}
+    for name, (method, network, untrained) in trained.items():
+        recipe = ALL[method]
+        estimate = frame.estimates[recipe.estimate]
+        inputs = recipe.inputs(jax.random.key(0), frame, estimate)
+        combine = _compiled(method)
+        images[f"{name}, {TRAINED}"] = combine(network, inputs)
+        images[f"{name}, {UNTRAINED}"] = combine(untrained, inputs)
+        plain = WITHOUT_NETWORK.get(method.partition("-")[0])
+        if plain:
+            images[f"{name}, {WITHOUT}"] = _plain(plain)(inputs)
+    return {name: errors.relative_l2(image, frame) for name, image in images.items()}
 
 
-def _separate(found: dict[str, Trained]) -> dict[str, Trained]:
-    """Return a denoiser and a combiner that were trained apart, as a joint network."""
-    parts = [found.get(f"{name}-light") for name in ("kernels", "njs-equal")]
-    if None in parts:
-        return {}
-    both, untrained = (
-        networks.Joint(jax.random.key(0), size="light") for _ in range(2)
-    )
-    both.denoiser, both.combiner = (part.network for part in parts if part)
-    name = "kernels-light and njs-equal-light"
-    return {name: Trained("kernels-njs", both, untrained)}
+@functools.cache
+def _compiled(method: str) -> Callable[..., Image]:
+    """A method's combiner as one program."""
+    return jax.jit(ALL[method].combine)
+
+
+@functools.cache
+def _plain(function: Callable[..., Image]) -> Callable[..., Image]:
+    """An estimator without a network as one program."""
+    return jax.jit(function)
 
 
 class Found(NamedTuple):
-    """Relative L2 by name, by "frame samples"; and the losses of all runs by name."""
+    """What was measured.
+
+    Attributes:
+        rows: relative L2 by name, by "view samples".
+        combines: the estimate that each network combines.
+        cards: of the networks, by name.
+    """
 
     rows: dict[str, dict[str, float]]
-    losses: dict[str, dict[str, list]]
+    combines: dict[str, str]
+    cards: dict[str, dict[str, Any]]
 
 
 def run(config: Config) -> Found:
@@ -189,60 +181,112 @@ def run(config: Config) -> Found:
         config: what to measure.
 
     Returns:
-        errors, and losses where there are runs.
+        errors and cards.
 
     Raises:
-        ValueError: if the folder holds no archive.
+        ValueError: if there are no frames.
     """
-    measures: dict[str, Callable[[Frame], dict[str, float]]] = {"": measure_inputs}
-    for name, network in networks_of(config.runs).items():
-        measures[name] = functools.partial(measure_network, of=network)
-    found = archives.measured(
-        config.folder, measures, results=config.results, quick=config.quick
-    )
+    trained = networks_of(config.runs)
+    store = Results(config.results)
     rows: dict[str, dict[str, float]] = {}
-    for key, measured in found.items():
-        frame, samples, *kind = key.split(" ")
-        row = rows.setdefault(f"{frame} {samples}", {})
-        row |= {" ".join(kind) + name: error for name, error in measured.items()}
-    cards = sorted(config.runs.glob("*/network.json")) if config.runs else []
-    losses = {c.parent.name: json.loads(c.read_text())["losses"] for c in cards}
-    return Found(rows, losses)
+    files = list(dataset.frames(config.folder, config.split))
+    for view, samples, path in files[:2] if config.quick else files:
+        key = f"{view} {samples}"
+        rows[key] = store.get(key, functools.partial(measure, path, trained))
+    combines = {name: ALL[each.method].estimate for name, each in trained.items()}
+    where = recipes.WEIGHTS if config.runs is None else config.runs
+    file = "{}.safetensors" if config.runs is None else "{}/network.safetensors"
+    cards = {name: recipes.read_card(where / file.format(name)) for name in trained}
+    return Found(rows, combines, cards)
 
 
-def better(row: errors.Row) -> float:
-    """Error of the better input."""
-    return min(row[name] for name in INPUTS)
-
-
-def summary(rows: dict[str, dict[str, float]], name: str) -> dict[str, float]:
-    """Ratios to the better input.
+def ratios(found: Found, name: str, kind: str) -> dict[str, list[float]]:
+    """Return errors over the better input's, by samples.
 
     Args:
-        rows: errors by "frame samples".
-        name: of a method.
+        found: by `run`.
+        name: of a network.
+        kind: trained, untrained or without a network.
 
     Returns:
-        geometric means by samples, and the "worst" frame.
+        a list of frames for each sample count.
     """
-    ratios = {
-        f"{samples}": [row[name] / better(row) for row in group]
-        for samples, group in errors.by_samples(rows).items()
+    estimate, of = found.combines[name], f"{name}, {kind}"
+    better = lambda row: min(row["path tracing"], row[estimate])
+    return {
+        str(samples): [max(row[of] / better(row), 0.02) for row in group]
+        for samples, group in errors.by_samples(found.rows).items()
     }
-    means = {samples: errors.geometric_mean(each) for samples, each in ratios.items()}
-    return means | {"worst": max(map(max, ratios.values()))}
 
 
-def curves(losses: dict[str, dict[str, list]]) -> Figure:
-    """Training and validation losses of all runs."""
-    columns = min(len(losses), 4)
-    lines = -(-len(losses) // columns)
+def summary(found: Found, name: str, kind: str) -> dict[str, float]:
+    """Return geometric means of `ratios` by samples, "all", and the "worst".
+
+    Args:
+        found: by `run`.
+        name: of a network.
+        kind: as of `ratios`.
+
+    Returns:
+        the means.
+    """
+    each = ratios(found, name, kind)
+    every = [ratio for group in each.values() for ratio in group]
+    means = {samples: errors.geometric_mean(group) for samples, group in each.items()}
+    return means | {"all": errors.geometric_mean(every), "worst": max(every)}
+
+
+def kinds(found: Found, name: str) -> list[str]:
+    """Return the kinds that were measured of a network.
+
+    Args:
+        found: by `run`.
+        name: of a network.
+
+    Returns:
+        trained, untrained and, where there is one, without a network.
+    """
+    row = next(iter(found.rows.values()))
+    return [k for k in (TRAINED, UNTRAINED, WITHOUT) if f"{name}, {k}" in row]
+
+
+def verdict(found: Found, name: str) -> dict[str, bool]:
+    """Return which promises of a shipped network hold.
+
+    Args:
+        found: by `run`.
+        name: of a network.
+
+    Returns:
+        by the promise.
+    """
+    means = {kind: summary(found, name, kind) for kind in kinds(found, name)}
+    trained, untrained = means[TRAINED], means[UNTRAINED]
+    counts = [key for key in trained if key not in ("all", "worst")]
+    said = {
+        "10 % below untrained": trained["all"] <= GAIN * untrained["all"],
+        "below untrained at every count": all(
+            trained[n] < untrained[n] for n in counts
+        ),
+        "worst at most 1.05": trained["worst"] <= WORST,
+    }
+    if WITHOUT in means:
+        said["5 % below the form without a network"] = (
+            trained["all"] <= MARGIN * means[WITHOUT]["all"]
+        )
+    return said
+
+
+def curves(cards: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Plot training and validation losses of all runs."""
+    columns = min(len(cards), 4)
+    lines = -(-len(cards) // columns)
     figure = Figure(figsize=(3.2 * columns, 2.6 * lines), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False)
-    for ax in axes.flat[len(losses) :]:
+    for ax in axes.flat[len(cards) :]:
         ax.axis("off")
-    for ax, (name, each) in zip(axes.flat, losses.items(), strict=False):
-        train.plot_losses(ax, each, title=name)
+    for ax, (name, card) in zip(axes.flat, cards.items(), strict=False):
+        draw_losses(ax, card, title=name)
     axes[0, 0].legend()
     return figure
 
@@ -254,32 +298,29 @@ def report(found: Found) -> Report:
         found: by `run`.
 
     Returns:
-        means beside the worst frame, every frame, and the losses.
+        means beside the worst frame, promises, every frame, and the losses.
     """
-    rows = found.rows
-    names = list(next(iter(rows.values())))
-    trained = [name for name in names if f"{name}, untrained" in names]
-
-    def said(name: str) -> str:
-        *means, worst = summary(rows, name).values()
-        return f"{', '.join(f'{mean:.2f}' for mean in means)} (worst {worst:.2f})"
-
-    each = "; ".join(
-        f"{name} {said(name)}, untrained {said(f'{name}, untrained')}"
-        for name in trained
-    )
+    cells, answers = [], []
+    for name in found.combines:
+        means = {kind: summary(found, name, kind) for kind in kinds(found, name)}
+        cells += [[name, kind, *each.values()] for kind, each in means.items()]
+        held = verdict(found, name)
+        missed = [promise for promise, kept in held.items() if not kept]
+        of = means[TRAINED]
+        others = [f"{k} {m['all']:.3f}" for k, m in means.items() if k != TRAINED]
+        said = f"misses: {', '.join(missed)}" if missed else "keeps every promise"
+        first = f"{name} {of['all']:.3f} (worst {of['worst']:.2f})"
+        answers.append(f"{', '.join([first, *others])}; {said}")
+    counts = list(summary(found, next(iter(found.combines)), TRAINED))
     answer = (
-        f"At {', '.join(map(str, errors.by_samples(rows)))} samples, in relative L2 "
-        f"divided by the better input's (geometric means of {len(rows)} frames in "
-        f"all): {each}; the best without a network, whitened, {said('whitened')}."
+        "Relative L2 over the better of path tracing and the estimate, geometric mean "
+        f"of {len(found.rows)} frames: {'. '.join(answers)}."
     )
-    cells = [[frame, *(row[n] for n in names)] for frame, row in rows.items()]
-    tables = [
-        errors.means(rows, names, better, title="error / better input"),
-        table(["frame", *names], cells),
-    ]
-    figures = {"Losses against steps": curves(found.losses)} if found.losses else {}
-    return Report(answer, "\n\n".join(tables), figures)
+    first = table(["network", "kind", *counts], cells)
+    names = list(next(iter(found.rows.values())))
+    every = [[frame, *(row[n] for n in names)] for frame, row in found.rows.items()]
+    body = f"{first}\n\n{table(['frame', *names], every)}"
+    return Report(answer, body, {"Losses against steps": curves(found.cards)})
 
 
 if __name__ == "__main__":

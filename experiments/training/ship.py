@@ -1,7 +1,7 @@
 """Put a trained network into the package, with its card.
 
-The card holds the network's training data, schedule and losses, and its errors, as
-`training.learned` measures them, on the frames of FOLDER, unseen in training.
+The card holds what `jscomb train` wrote (data, schedule, losses, validation), and the
+errors that `training.learned` measures on the test split of FOLDER, which took no part.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ import tyro
 
 from experiments.common.command import tool
 from experiments.training import learned
-from jscomb.learning.recipes import WEIGHTS
+from jscomb.learning.recipes import WEIGHTS, read_card
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Config:
     """What to ship.
 
     Attributes:
-        method: njs, dsc or pd.
-        network: folder of a finished run, in a folder of runs.
-        folder: of NumPy archives to measure on.
+        method: njs, dsc, dsc-photons or pd.
+        network: folder of a run, in a folder of runs.
+        folder: of `experiments.data.dataset`.
         results: file that stores results as they come.
         out: folder of the package's networks.
     """
@@ -45,27 +45,23 @@ def run(config: Config) -> dict:
         the card.
 
     Raises:
-        ValueError: if the run is not finished or of another method.
+        ValueError: if the run is of another method.
     """
-    card = json.loads((config.network / "network.json").read_text())
-    name = config.network.name
+    file, name = config.network / "network.safetensors", config.network.name
+    card = read_card(file)
     if card["method"] != config.method:
         raise ValueError(f"{config.network} is a run of {card['method']}")
-    measured = learned.Config(
-        config.folder, runs=config.network.parent, results=config.results
-    )
-    rows, _ = learned.run(measured)
-    if name not in next(iter(rows.values())):
-        raise ValueError(f"{config.network} is not finished")
-    card["error"] = {
-        "what": "relative L2 divided by the better of path tracing and oidn: geometric"
-        " mean over frames of scenes that were not trained on, by samples, and worst",
-        "oidn": learned.summary(rows, "oidn"),
-        config.method: learned.summary(rows, name),
+    runs, results = config.network.parent, config.results
+    found = learned.run(learned.Config(config.folder, runs=runs, results=results))
+    card["test"] = {
+        "what": card["validation"]["what"],
+        "frames": len(found.rows),
+        **{k: learned.summary(found, name, k) for k in learned.kinds(found, name)},
+        "promises": learned.verdict(found, name),
     }
     config.out.mkdir(exist_ok=True)
     target = config.out / f"{config.method}.safetensors"
-    shutil.copyfile(config.network / "network.safetensors", target)
+    shutil.copyfile(file, target)
     target.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
     return card
 

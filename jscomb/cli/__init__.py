@@ -1,4 +1,4 @@
-"""The command `jscomb`: render, combine, compare and describe frames.
+"""The command `jscomb`: render, combine, compare and describe frames, and train.
 
 Errors of the input are one line on standard error and exit status 2.
 """
@@ -19,8 +19,9 @@ from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
 from jscomb.cli._rendering import render, render_file
 from jscomb.cli._showing import compare, demo, info
+from jscomb.cli._training import Run, prepare, split_files, train, train_files
 
-__all__ = ["main", "render_file"]
+__all__ = ["Run", "main", "prepare", "render_file", "split_files", "train_files"]
 
 
 def main() -> None:
@@ -54,7 +55,10 @@ def _parse() -> Callable[[], None]:
     try:
         with contextlib.redirect_stderr(said):
             return tyro.extras.subcommand_cli_from_dict(
-                {c.__name__: later(c) for c in (demo, render, combine, compare, info)},
+                {
+                    c.__name__: later(c)
+                    for c in (demo, render, combine, compare, info, train)
+                },
                 prog="jscomb",
                 description="Combine unbiased and biased Monte Carlo renderings.",
             )

@@ -40,8 +40,6 @@ def denoise(
     noisy: Image,
     variance: Variance,
     features: Features,
-    *,
-    window: int = 11,
 ) -> Image:
     """Average each pixel's window with weights that a network predicts.
 
@@ -54,26 +52,24 @@ def denoise(
         noisy: x, linear radiance, shape [H,W,C].
         variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
         features: about in [-1, 1], shape [H,W,F]; see `features.stack`.
-        window: width of the windows in pixels, odd; the network's.
 
     Returns:
         the denoised image, linear radiance, shape [H,W,C]; invalid pixels are excluded
         and unchanged, or 0 where x is not finite.
 
     Raises:
-        ValueError: while tracing, if shapes differ, or the network has another window.
+        ValueError: while tracing, if shapes differ.
 
     Example:
-        >>> even = lambda x, v, f: Kernels(x, lambda i: jnp.ones((*i.shape[:2], 9)), 0)
+        >>> nine = lambda near: jnp.ones((*near.shape[:2], 9))
+        >>> even = lambda x, v, f: Kernels(x, nine, 0, 3)
         >>> x = jnp.array([1.0, 2.0, 6.0]).reshape(1, 3, 1)
-        >>> y = denoise(even, x, 0 * x, x[..., :0], window=3)
+        >>> y = denoise(even, x, 0 * x, x[..., :0])
         >>> print([f"{value:.2f}" for value in y.ravel()])
         ['1.50', '3.00', '4.00']
     """
     check_same_shape(noisy=noisy, variance=variance)
-    denoise_one = lambda x, v: denoise_normalised(
-        network, x, v, features, window=window
-    )
+    denoise_one = lambda x, v: denoise_normalised(network, x, v, features)
     return at_unit_luminance(denoise_one, noisy, squares=[variance])
 
 
@@ -82,8 +78,6 @@ def denoise_normalised(
     noisy: Image,
     variance: Variance,
     features: Features,
-    *,
-    window: int = 11,
 ) -> Image:
     """Denoise a normalised image; for crops of a normalised frame, and for training.
 
@@ -94,18 +88,18 @@ def denoise_normalised(
         noisy: x, normalised radiance, shape [H,W,C].
         variance: v of the mean x, at least zero, shape [H,W,C].
         features: about in [-1, 1], shape [H,W,F].
-        window: width of the windows in pixels, odd; the network's.
 
     Returns:
         the denoised image, normalised radiance, shape [H,W,C].
 
     Raises:
-        ValueError: while tracing, if shapes differ, or the network has another window.
+        ValueError: while tracing, if shapes differ.
 
     Example:
-        >>> even = lambda x, v, f: Kernels(x, lambda i: jnp.ones((*i.shape[:2], 9)), 0)
+        >>> nine = lambda near: jnp.ones((*near.shape[:2], 9))
+        >>> even = lambda x, v, f: Kernels(x, nine, 0, 3)
         >>> x = jnp.array([1.0, 2.0, 6.0]).reshape(1, 3, 1)
-        >>> y = denoise_normalised(even, x, 0 * x, x[..., :0], window=3)
+        >>> y = denoise_normalised(even, x, 0 * x, x[..., :0])
         >>> print([f"{value:.2f}" for value in y.ravel()])
         ['1.50', '3.00', '4.00']
     """
@@ -114,7 +108,7 @@ def denoise_normalised(
     kernels = network(x, v, f)
     trust = 1 / (1 + jnp.mean(v, axis=-1, keepdims=True))
     both = jnp.concatenate([trust * x, trust], axis=-1)
-    (mean,) = predicted_mean(both[None], kernels, window, mask=valid)
+    (mean,) = predicted_mean(both[None], kernels, mask=valid)
     image = weighted_ratio(mean[..., :-1], mean[..., -1:])
     return jnp.where(valid, image, first_finite(noisy))
 
@@ -149,27 +143,25 @@ def neural_inputs(frame: Frame) -> dict[str, Image]:
     return images
 
 
-def denoise_inputs(
-    network: Network, inputs: Mapping[str, Image], *, window: int = 11
-) -> Image:
+def denoise_inputs(network: Network, inputs: Mapping[str, Image]) -> Image:
     """Denoise what `neural_inputs` returns, or crops of it.
 
     Args:
         network: as for `denoise`.
         inputs: images by name, normalised.
-        window: width of the windows in pixels, odd; the network's.
 
     Returns:
         the denoised image, normalised radiance, shape [H,W,3].
 
     Example:
-        >>> even = lambda x, v, f: Kernels(x, lambda i: jnp.ones((*i.shape[:2], 9)), 0)
+        >>> nine = lambda near: jnp.ones((*near.shape[:2], 9))
+        >>> even = lambda x, v, f: Kernels(x, nine, 0, 3)
         >>> x = jnp.broadcast_to(jnp.array([1.0, 2.0, 6.0])[:, None], (1, 3, 3))
         >>> names = "noisy", "variance", "albedo", "normal", "depth"
         >>> inputs = dict(zip(names, [x, 0 * x, x, x, x[..., :1]], strict=True))
-        >>> print(denoise_inputs(even, inputs, window=3)[0, :, 0])
+        >>> print(denoise_inputs(even, inputs)[0, :, 0])
         [1.5 3.  4. ]
     """
     features = jnp.concatenate([inputs[name] for name in _FEATURES], axis=-1)
     noisy, variance = inputs["noisy"], inputs["variance"]
-    return denoise_normalised(network, noisy, variance, features, window=window)
+    return denoise_normalised(network, noisy, variance, features)

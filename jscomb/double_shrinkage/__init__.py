@@ -26,8 +26,10 @@ Unbiased Monte Carlo Renderings", 2025 (DSC; eq. numbers above).
 
 from jscomb.double_shrinkage._combine import Factors, combine, factors
 from jscomb.double_shrinkage._estimate import (
+    Dependence,
     biased_error,
     confidence,
+    dependence,
     radius_bias,
     unbiased_error,
 )
@@ -35,6 +37,7 @@ from jscomb.double_shrinkage._frame import (
     NEEDS,
     Inputs,
     combine_frame,
+    depends,
     make_inputs,
     neural_combine_frame,
     neural_inputs,
@@ -45,6 +48,7 @@ from jscomb.double_shrinkage._prior import blend_prior, radiance_prior
 
 __all__ = [
     "NEEDS",
+    "Dependence",
     "Factors",
     "Filters",
     "Inputs",
@@ -54,6 +58,8 @@ __all__ = [
     "combine_frame",
     "combine_inputs",
     "confidence",
+    "dependence",
+    "depends",
     "factors",
     "make_inputs",
     "neural_combine",

@@ -1,5 +1,6 @@
 """Double shrinkage of a normalised frame and an estimate of another integrator."""
 
+import warnings
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,9 +10,10 @@ from jscomb.double_shrinkage._combine import combine, factors
 from jscomb.double_shrinkage._estimate import (
     biased_error,
     confidence,
+    dependence,
     unbiased_error,
 )
-from jscomb.double_shrinkage._neural import KERNEL, Network, combine_inputs
+from jscomb.double_shrinkage._neural import Network, combine_inputs
 from jscomb.double_shrinkage._prior import blend_prior
 from jscomb.features import select, stack
 from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
@@ -23,6 +25,10 @@ NEEDS = Needs(variance=True, halves=True, normalised=True)
 
 _NAME = "double_shrinkage"
 _RIDGE = 0.05
+_WITHOUT_HALVES = (
+    f"{_NAME} needs an estimate with halves: make it from each half frame, too "
+    "(jscomb.frame.with_halves)"
+)
 
 Halves = Float[Array, "2 h w c"]
 
@@ -122,10 +128,7 @@ def make_inputs(
     """
     frame.require(_NAME, NEEDS)
     if estimate.halves is None:
-        raise ValueError(
-            f"{_NAME} needs an estimate with halves: make it from each half frame, too "
-            "(jscomb.frame.with_halves)"
-        )
+        raise ValueError(_WITHOUT_HALVES)
     features = stack(frame)
     needed = select([features])
     u, b = frame.color, estimate.image
@@ -216,8 +219,9 @@ def plan_neural(
     """Return the network's combination of a frame, to apply whole or by crops.
 
     Args:
-        network: with kernels of 13x13, a pytree; the halo comes from its `reach`, the
-            distance that it sees, and crops start at multiples of its `multiple`.
+        network: a pytree; the halo comes from its `reach`, the distance that it sees,
+            and the width `window` of its kernels, and crops start at multiples of its
+            `multiple`.
         frame: normalised, with half buffers.
         estimate: with halves.
         stride: pixels between the centres of the prior's windows.
@@ -225,6 +229,10 @@ def plan_neural(
     Returns:
         `combine_inputs` of the network, and the frame's `neural_inputs`; its halo is
         None if the network has no reach.
+
+    Warns:
+        UserWarning: if the network's attribute `serves` says that it was trained on
+            another kind of biased image, denoised or independent.
 
     Example:
         >>> import jax
@@ -237,7 +245,49 @@ def plan_neural(
         (4, 4, 3)
     """
     inputs = neural_inputs(frame, estimate, stride=stride)
-    return network_plan(combine_inputs, network, inputs, kernel=KERNEL)
+    _warn_of_use(network, frame, estimate)
+    return network_plan(combine_inputs, network, inputs)
+
+
+def depends(frame: Frame, estimate: Estimate) -> bool:
+    """Return whether an estimate was made from the samples of a frame, by its noise.
+
+    Args:
+        frame: with half buffers.
+        estimate: with halves.
+
+    Returns:
+        True for a denoised image, False for one of another integrator.
+
+    Raises:
+        ValueError: if either has no halves.
+
+    Example:
+        >>> import jax
+        >>> from jscomb.frame import make_frame
+        >>> x = jax.random.normal(jax.random.key(0), (2, 64, 64, 3))
+        >>> print(depends(make_frame(x), Estimate(0.1 * x[0], 0.1 * x)))
+        True
+    """
+    frame.require(_NAME, Needs(halves=True))
+    if estimate.halves is None:
+        raise ValueError(_WITHOUT_HALVES)
+    halves = [half.color for half in frame.halves()]
+    return bool(compiled(dependence)(*halves, *estimate.halves).certain)
+
+
+def _warn_of_use(network: Network, frame: Frame, estimate: Estimate) -> None:
+    """Warn of a biased image of the kind that the network was not trained on."""
+    serves = getattr(network, "serves", "any")
+    if serves == "any":
+        return
+    found = "denoised" if depends(frame, estimate) else "independent"
+    if found != serves:
+        warnings.warn(
+            f"this network combines {serves} images, but the noise of the biased image "
+            f"says that it is {found}: expect a larger error",
+            stacklevel=2,
+        )
 
 
 def neural_combine_frame(

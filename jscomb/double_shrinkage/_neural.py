@@ -12,8 +12,6 @@ from jscomb.numerics.kernels import Kernels, predicted_mean
 from jscomb.numerics.luminance import at_unit_luminance
 from jscomb.typing import Image
 
-KERNEL = 13  # width of the paper's kernels in pixels
-
 Error = Float[Array, "h w 1"]
 
 
@@ -39,8 +37,6 @@ def neural_combine(
     biased: Image,
     variance: Error,
     mse: Error,
-    *,
-    window: int = KERNEL,
 ) -> Image:
     """Blend two integrators and a prior by errors that a network pools.
 
@@ -57,20 +53,19 @@ def neural_combine(
         variance: sample variance v of the mean u, mean over channels, squared radiance,
             at least zero, shape [H,W,1].
         mse: m of b, same.
-        window: width of the kernels in pixels, odd; the network's.
 
     Returns:
         the blend, linear radiance, shape [H,W,C]; at an invalid pixel the first finite
         of (b, u), else 0.
 
     Raises:
-        ValueError: if shapes differ, or the network has another window.
+        ValueError: if shapes differ.
 
     Example:
         >>> import jax
         >>> at = lambda value: jnp.full((2, 2, 1), value)
         >>> head = lambda near: jnp.ones((*near.shape[:2], 2 * 13**2))
-        >>> network = lambda *_: Filters(Kernels(at(1.0), head, 0), at(0.25))
+        >>> network = lambda *_: Filters(Kernels(at(1.0), head, 0, 13), at(0.25))
         >>> fast = jax.jit(neural_combine, static_argnames="network")
         >>> images = at(0.0), at(4.0), at(8.0), at(1.0), at(3.0)
         >>> print(fast(network, *images)[0, 0].round(3))
@@ -81,15 +76,13 @@ def neural_combine(
     check_same_shape(unbiased=unbiased, biased=biased, prior=prior)
     names = "unbiased", "prior", "biased", "variance", "mse"
     normalised = lambda *images: combine_inputs(
-        network, dict(zip(names, images, strict=True)), window=window
+        network, dict(zip(names, images, strict=True))
     )
     images, squares = (unbiased, prior, biased), (variance, mse)
     return at_unit_luminance(normalised, *images, squares=squares)
 
 
-def combine_inputs(
-    network: Network, inputs: Mapping[str, Image], *, window: int = KERNEL
-) -> Image:
+def combine_inputs(network: Network, inputs: Mapping[str, Image]) -> Image:
     """Blend normalised images by name, for crops of a frame and for training.
 
     Local, and not scale-equivariant: `neural_combine` without its normalisation.
@@ -97,19 +90,18 @@ def combine_inputs(
     Args:
         network: as for `neural_combine`.
         inputs: prior, unbiased, biased, variance and mse, as `neural_inputs` makes.
-        window: width of the kernels in pixels, odd; the network's.
 
     Returns:
         the blend, normalised radiance, shape [H,W,C]; at an invalid pixel the first
         finite of (biased, unbiased), else 0.
 
     Raises:
-        ValueError: if shapes differ, or the network has another window.
+        ValueError: if shapes differ.
 
     Example:
         >>> at = lambda value: jnp.full((2, 2, 1), value)
         >>> head = lambda near: jnp.ones((*near.shape[:2], 2 * 13**2))
-        >>> network = lambda *_: Filters(Kernels(at(1.0), head, 0), at(0.25))
+        >>> network = lambda *_: Filters(Kernels(at(1.0), head, 0, 13), at(0.25))
         >>> inputs = dict(prior=at(0.0), unbiased=at(4.0), biased=at(8.0))
         >>> inputs |= dict(variance=at(1.0), mse=at(3.0))
         >>> print(combine_inputs(network, inputs)[0, 0].round(3))
@@ -123,6 +115,6 @@ def combine_inputs(
     check_same_shape(variance=v, mse=m)
     valid, p, u, b, v, m = zero_invalid(p, u, b, v, m)
     kernels, eta = network(p, u, b, v, m)
-    v, m = predicted_mean(jnp.stack([v, m]), kernels, window, mask=valid)
+    v, m = predicted_mean(jnp.stack([v, m]), kernels, mask=valid)
     blend = combine(p, u, b, v, m, eta)
     return jnp.where(valid, blend, first_finite(inputs["biased"], inputs["unbiased"]))

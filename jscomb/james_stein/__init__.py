@@ -51,7 +51,7 @@ from jscomb.james_stein._bands import (
     strength_for,
 )
 from jscomb.james_stein._combine import combine, combine_dual, reach
-from jscomb.james_stein._estimate import guide_noise, risk, worth_regressing
+from jscomb.james_stein._estimate import guide_noise, risk, risk_bound, worth_regressing
 from jscomb.james_stein._frame import (
     BANDS_NEEDS,
     NEEDS,
@@ -67,8 +67,11 @@ from jscomb.james_stein._frame import (
 )
 from jscomb.james_stein._neural import (
     Parameters,
+    Rule,
     combine_inputs,
     neural_combine,
+    neural_combine_dual,
+    rule_of,
 )
 from jscomb.james_stein._regression import cross_regression
 from jscomb.numerics.variances import robust_variance, smooth_variance
@@ -79,6 +82,7 @@ __all__ = [
     "NEURAL_NEEDS",
     "Parameters",
     "Regressed",
+    "Rule",
     "combine",
     "combine_bands",
     "combine_dual",
@@ -87,6 +91,7 @@ __all__ = [
     "cross_regression",
     "guide_noise",
     "neural_combine",
+    "neural_combine_dual",
     "neural_combine_frame",
     "neural_inputs",
     "plan_bands",
@@ -96,7 +101,9 @@ __all__ = [
     "reach_of_bands",
     "regress",
     "risk",
+    "risk_bound",
     "robust_variance",
+    "rule_of",
     "smooth_variance",
     "strength_for",
     "worth_regressing",

@@ -99,8 +99,9 @@ def combine_dual(
     *,
     window: int = 15,
     whiten: bool = False,
+    share: Float[Array, "h w 1"] | float = 0.5,
 ) -> Image:
-    """Combine each half's x with the other half's y, and average.
+    """Combine each half's x with the other half's y, and blend.
 
     The biased image of the other half does not depend on this half's noise, as the
     theorem requires; the price is that each half has twice the variance.
@@ -114,6 +115,8 @@ def combine_dual(
             for `combine`; doubled here.
         window: width of the windows in pixels, odd, at least three.
         whiten: allow each pixel its own variance within a window.
+        share: alpha, of the combination of x_a with y_b, in [0, 1]: a number or, of
+            each pixel, shape [H,W,1].
 
     Returns:
         the combined rendering, linear radiance, shape [H,W,C].
@@ -130,7 +133,7 @@ def combine_dual(
     """
     a = combine(unbiased_a, biased_b, 2 * variance, window=window, whiten=whiten)
     b = combine(unbiased_b, biased_a, 2 * variance, window=window, whiten=whiten)
-    return (a + b) / 2
+    return share * a + (1 - share) * b
 
 
 def prepare(

@@ -24,7 +24,7 @@ from jscomb.numerics.guards import (
 )
 from jscomb.typing import Image, Key, Scalar, Variance
 
-__all__ = ["COARSE", "guide_noise", "risk", "worth_regressing"]
+__all__ = ["COARSE", "guide_noise", "risk", "risk_bound", "worth_regressing"]
 
 COARSE = 4  # stride of the regression that decides for a frame
 
@@ -68,6 +68,46 @@ def risk(
     keeps = (energy > noise) | (noise <= 0)
     estimate = jnp.where(keeps, count * s2 - noise * lost, energy - count * s2)
     return jnp.where(valid, estimate, 0.0)
+
+
+def risk_bound(
+    bias: Image,
+    biased_variance: Variance,
+    variance: Variance,
+    *,
+    window: int = 15,
+) -> Image:
+    """Bound the expected squared error of each window's James-Stein result.
+
+    The expectation of the rule without the positive part, which has no smaller error;
+    by Jensen's inequality, for Gaussian noise of equal variance and a y independent of
+    x: below p s2, the error of x, however large the bias.
+
+    Args:
+        bias: Lambda, expectation of y minus the truth, radiance, shape [H,W,C].
+        biased_variance: xi2 of y, squared radiance, at least zero, same shape.
+        variance: s2_c of each window, squared radiance, at least zero, same shape.
+        window: width of the windows in pixels, odd, at least three.
+
+    Returns:
+        the bound of the sum of squared errors in the window of each pixel, squared
+        radiance, shape [H,W,C]; 0 at an invalid pixel.
+
+    Raises:
+        ValueError: while tracing, if the shapes differ or `window` is even or < 3.
+
+    Example:
+        >>> one = jnp.ones((3, 3, 1))
+        >>> print(f"{risk_bound(2 * one, 0 * one, one, window=3)[1, 1, 0]:.2f}")
+        7.91
+
+    Source: NJS eq. 9: p s2 - (p-2)^2 s2^2 / (Lambda' Lambda + p xi2 + p s2).
+    """
+    valid, bias, xi2, s2 = prepare(bias, biased_variance, variance, window)
+    energy, count = sum_and_count(jnp.square(bias) + xi2, valid, window)
+    noise, energy = degrees(count) * s2, energy + count * s2
+    saved = noise * divide(noise, energy, where=energy > 0)
+    return jnp.where(valid, count * s2 - saved, 0.0)
 
 
 def worth_regressing(

@@ -12,7 +12,7 @@ from jscomb.frame import Estimate, Frame, Maker, Needs, with_halves
 from jscomb.james_stein._bands import combine_bands, reach_of_bands, strength_for
 from jscomb.james_stein._combine import combine, reach
 from jscomb.james_stein._estimate import COARSE, worth_regressing
-from jscomb.james_stein._neural import KERNEL, Network, combine_inputs
+from jscomb.james_stein._neural import Network, combine_inputs, rule_of
 from jscomb.james_stein._regression import RIDGE, cross_regression
 from jscomb.metrics import Change
 from jscomb.numerics.tiles import Local, compiled, network_plan
@@ -251,7 +251,7 @@ def neural_combine_frame(
         0.15
         0.13
 
-    Source: NJS section 4.4; with the whitened rule.
+    Source: NJS section 4.4; by the rule that the network was trained for.
     """
     frame.require("njs", NEURAL_NEEDS)
 
@@ -293,13 +293,8 @@ def plan_neural(
         ['biased_a', 'biased_b', 'unbiased', 'variance'] 4
     """
     inputs = neural_inputs(key, frame, estimate, stride=stride)
-    return network_plan(
-        combine_inputs,
-        network,
-        inputs,
-        kernel=KERNEL,
-        around=reach(window=7),
-    )
+    around = reach(window=rule_of(network).window)
+    return network_plan(combine_inputs, network, inputs, around=around)
 
 
 def neural_inputs(

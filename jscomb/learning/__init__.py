@@ -1,9 +1,9 @@
 """Networks that decide what the estimators leave open, and their training.
 
 `recipes` defines what each network sees, how its output makes an image, and loads the
-parameters that come with the package; `networks` are the papers'; `training`, `losses`
-and `checkpoints` make and store others. `networks` and `recipes` import flax, which is
-slow, so modules are imported by name::
+parameters that come with the package; `networks` are the papers'; `examples`,
+`training`, `losses` and `checkpoints` make and store others, as `jscomb train` does.
+Most import flax, which is slow, so modules are imported by name::
 
     from jscomb.learning import recipes
     recipe, network = recipes.RECIPES["njs"], recipes.shipped("njs")
@@ -11,4 +11,4 @@ slow, so modules are imported by name::
     image = recipe.combine(network, inputs)
 """
 
-__all__ = ["checkpoints", "losses", "networks", "recipes", "training"]  # pyright: ignore
+__all__ = ["checkpoints", "examples", "losses", "networks", "recipes", "training"]  # pyright: ignore

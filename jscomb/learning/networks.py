@@ -3,6 +3,8 @@
 Layout: images [H,W,C], normalised; `vmap` for a batch. Parameters are float32, from a
 typed key. Size "full" is the paper's, "light" has half the channels and a quarter of
 the work. `window` is the width in pixels, odd, of the kernels that a network predicts.
+What a network was trained for (a rule, a form) is an attribute of it, which its
+combiner obeys.
 
 Every network has a `reach`, the distance in rows or columns of the farthest input pixel
 that an output pixel depends on; crops have to start at multiples of its `multiple`.
@@ -23,7 +25,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jscomb.double_shrinkage import Filters
-from jscomb.james_stein import Parameters
+from jscomb.james_stein import Parameters, Rule
 from jscomb.learning.losses import compress
 from jscomb.numerics.convolution import doubled
 from jscomb.numerics.kernels import Kernels
@@ -49,12 +51,15 @@ __all__ = [
 ]
 
 Size = Literal["light", "full"]
+Form = Literal["quotient", "direct"]
+Serves = Literal["denoised", "independent", "any"]
 
 _WIDTHS = {"full": (32, 64, 128), "light": (16, 32, 64)}  # of a U-Net's levels
 _MIXING_WIDTH = {"full": 48, "light": 24}
 _MINIMUM_WEIGHT = 1e-4  # NJS adds it to its weights
 _MAXIMUM_EXPONENT = 30.0  # of a confidence; beyond it the prior has no weight
 _VARIANCE_UNIT = 0.01  # squared normalised radiance
+_PAPER = Rule()
 
 
 class UNet(nnx.Module):
@@ -140,6 +145,8 @@ class JamesSteinNetwork(_Headed):
         body: U-Net.
         kernels: convolution to the weights of the variances.
         share: convolution to alpha.
+        window: width of the kernels in pixels.
+        rule: that its variances are for.
 
     Example:
         >>> network = JamesSteinNetwork(jax.random.key(0), size="light")
@@ -150,10 +157,13 @@ class JamesSteinNetwork(_Headed):
     Source: NJS section 4.4.
     """
 
-    def __init__(self, key: Key, *, window: int = 15, size: Size = "full"):
+    def __init__(
+        self, key: Key, *, window: int = 15, size: Size = "full", rule: Rule = _PAPER
+    ):
         """Draw all convolutions."""
         body, kernels, share = jax.random.split(key, 3)
         width = _WIDTHS[size][0]
+        self.window, self.rule = window, rule
         self.body = UNet(body, 12, size=size)
         self.kernels = Convolution(kernels, width, check_window(window) ** 2)
         self.share = Convolution(share, width, 1)
@@ -170,7 +180,8 @@ class JamesSteinNetwork(_Headed):
         features = self.body(jnp.concatenate([*radiance, v], axis=-1))
         head = lambda f: jax.nn.relu(self.kernels(f, inner=True)) + _MINIMUM_WEIGHT
         alpha = jax.nn.sigmoid(self.share(features))
-        return Parameters(Kernels(features, head, self.kernels.reach), alpha)
+        kernels = Kernels(features, head, self.kernels.reach, self.window)
+        return Parameters(kernels, alpha)
 
 
 class ShrinkageNetwork(_Headed):
@@ -180,6 +191,9 @@ class ShrinkageNetwork(_Headed):
         body: U-Net.
         kernels: projection to two kernels.
         confidence: projection to the logarithm of eta².
+        window: width of the kernels in pixels.
+        serves: biased images that it was trained on: denoised, independent (of another
+            integrator), or any.
 
     Example:
         >>> network = ShrinkageNetwork(jax.random.key(0), size="light")
@@ -191,11 +205,14 @@ class ShrinkageNetwork(_Headed):
     Source: DSC section 4.3.
     """
 
-    def __init__(self, key: Key, *, window: int = 13, size: Size = "full"):
+    def __init__(
+        self, key: Key, *, window: int = 13, size: Size = "full", serves: Serves = "any"
+    ):
         """Draw all convolutions."""
         body, kernels, confidence = jax.random.split(key, 3)
         width = _WIDTHS[size][0]
         self.body = UNet(body, 11, size=size)
+        self.window, self.serves = window, serves
         weights = 2 * check_window(window) ** 2
         self.kernels = Convolution(kernels, width, weights, size=1)
         self.confidence = Convolution(confidence, width, 1, size=1)
@@ -219,7 +236,8 @@ class ShrinkageNetwork(_Headed):
             self.confidence(features), -_MAXIMUM_EXPONENT, _MAXIMUM_EXPONENT
         )
         head = lambda f: _softmax(self.kernels(f), parts=2)
-        return Filters(Kernels(features, head, self.kernels.reach), jnp.exp(exponent))
+        kernels = Kernels(features, head, self.kernels.reach, self.window)
+        return Filters(kernels, jnp.exp(exponent))
 
 
 class MixingNetwork(nnx.Module):
@@ -229,6 +247,7 @@ class MixingNetwork(nnx.Module):
         first: convolution of 5x5.
         blocks: two residual blocks of two convolutions.
         last: convolution to three numbers a channel.
+        form: of alpha, one of `progressive.FORMS`.
 
     Example:
         >>> network = MixingNetwork(jax.random.key(0), size="light")
@@ -241,7 +260,7 @@ class MixingNetwork(nnx.Module):
 
     multiple = 1
 
-    def __init__(self, key: Key, *, size: Size = "full"):
+    def __init__(self, key: Key, *, size: Size = "full", form: Form = "quotient"):
         """Draw all convolutions."""
         keys = iter(jax.random.split(key, 6))
         width = _MIXING_WIDTH[size]
@@ -249,6 +268,9 @@ class MixingNetwork(nnx.Module):
         pair = lambda: [Convolution(next(keys), width, width) for _ in range(2)]
         self.blocks = nnx.List([nnx.List(pair()) for _ in range(2)])
         self.last = Convolution(next(keys), width, 9)
+        self.form = form
+        if form == "quotient":  # begins with a denominator of one
+            self.last.bias = nnx.Param(self.last.bias[...].at[6:].set(1.0))
 
     @property
     def reach(self) -> int:
@@ -279,6 +301,7 @@ class KernelPredictor(_Headed):
     Attributes:
         body: U-Net.
         kernels: convolution to one softmax kernel a pixel.
+        window: width of the kernels in pixels.
 
     Example:
         >>> network = KernelPredictor(jax.random.key(0), window=5, size="light")
@@ -299,6 +322,7 @@ class KernelPredictor(_Headed):
         """Draw all convolutions."""
         body, kernels = jax.random.split(key)
         self.body = UNet(body, 6 + features, size=size)
+        self.window = window
         weights = check_window(window) ** 2
         self.kernels = Convolution(kernels, _WIDTHS[size][0], weights)
 
@@ -312,7 +336,7 @@ class KernelPredictor(_Headed):
         inputs = [compress(unbiased), _compress_variance(variance), features]
         body = self.body(jnp.concatenate(inputs, axis=-1))
         head = lambda f: _softmax(self.kernels(f, inner=True), parts=1)
-        return Kernels(body, head, self.kernels.reach)
+        return Kernels(body, head, self.kernels.reach, self.window)
 
 
 class Joint(nnx.Module):
@@ -320,7 +344,7 @@ class Joint(nnx.Module):
 
     Attributes:
         denoiser: kernel predictor.
-        combiner: James-Stein network.
+        combiner: James-Stein network, by the paper's rule.
 
     Example:
         >>> network = Joint(jax.random.key(0), size="light")

@@ -2,7 +2,7 @@
 
 A network is trained and used through the same recipe. Frames are normalised, so inputs
 are too. `RECIPES` lists every network by the name of its method; the parameters of
-some come with the package (`shipped`).
+some come with the package (`shipped`), each with a card that says what they are for.
 """
 
 import functools
@@ -14,9 +14,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jscomb import double_shrinkage, james_stein, metrics, progressive
-from jscomb.denoisers import kernel_predicting, oidn
+from jscomb import double_shrinkage, james_stein, progressive
+from jscomb.denoisers import bilateral, kernel_predicting, oidn
+from jscomb.features import stack
 from jscomb.frame import Estimate, Frame
 from jscomb.learning import checkpoints, losses, networks
 from jscomb.numerics import luminance
@@ -29,12 +32,16 @@ __all__ = [
     "exchanged",
     "in_unit",
     "load_network",
+    "of_mean",
+    "options_of",
+    "read_card",
     "shipped",
 ]
 
 Network = Any  # a pytree of parameters that can be called
 Inputs = dict[str, Image]
 MakeInputs = Callable[[Key, Frame, Estimate], Inputs]
+Halves = Float[Array, "2 h w c"]
 
 WEIGHTS = pathlib.Path(str(importlib.resources.files("jscomb.learning"))) / "weights"
 """Folder of the parameters that come with the package, and of their cards."""
@@ -47,20 +54,47 @@ class Recipe(NamedTuple):
     """A network with its inputs, its combiner and its loss.
 
     Attributes:
-        network: its class, to be called with a key and a size.
+        network: its class, to be called with a key, a size and `options`.
         inputs: from a key, a normalised frame and an estimate to images by name.
         combine: from a network and its inputs to a normalised image.
-        loss: of an image and a reference, both normalised.
-        other: alternative inputs that training draws as often; None for none.
+        loss: of an image and the halves of a reference, all normalised.
+        options: of the network: what it is for, in words that a card can hold.
+        estimate: name of the frame's estimate that it combines.
+        others: inputs in place of `inputs` that training draws as often.
         training: options of `combine` while training.
     """
 
     network: Callable[..., Network]
     inputs: MakeInputs
     combine: Callable[..., Image]
-    loss: Callable[[Image, Image], Scalar]
-    other: MakeInputs | None = None
+    loss: Callable[[Image, Halves], Scalar] = losses.relative_l2
+    options: Mapping[str, Any] = types.MappingProxyType({})
+    estimate: str = "oidn"
+    others: tuple[MakeInputs, ...] = ()
     training: Mapping[str, Any] = types.MappingProxyType({})
+
+    def make(self, key: Key, **options: Any) -> Network:
+        """Return a network with new parameters; options in place of the recipe's."""
+        return self.network(key, **{**self.options, **options})
+
+
+def of_mean(
+    loss: Callable[[Image, Image], Scalar],
+) -> Callable[[Image, Halves], Scalar]:
+    """Return a loss of an image and a reference as one of the reference's halves.
+
+    Args:
+        loss: of an image and a reference, such as `losses.log_l2`.
+
+    Returns:
+        the loss with the mean of the halves.
+
+    Example:
+        >>> halves = jnp.stack([jnp.zeros((1, 1, 3)), jnp.ones((1, 1, 3))])
+        >>> print(f"{of_mean(losses.log_l2)(halves[0], halves):.3f}")
+        0.943
+    """
+    return lambda image, halves: loss(image, jnp.mean(halves, axis=0))
 
 
 def exchanged(inputs: MakeInputs) -> MakeInputs:
@@ -73,7 +107,6 @@ def exchanged(inputs: MakeInputs) -> MakeInputs:
         the function with x and y, and v and s, exchanged.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> names, one = ("unbiased", "biased", "variance", "sure"), jnp.ones((1, 1, 1))
         >>> images = {name: k * one for k, name in enumerate(names)}
@@ -85,12 +118,9 @@ def exchanged(inputs: MakeInputs) -> MakeInputs:
 
     def other(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
         found = inputs(key, frame, estimate)
-        return {
-            "unbiased": found["biased"],
-            "biased": found["unbiased"],
-            "variance": found["sure"],
-            "sure": found["variance"],
-        }
+        pairs = {"unbiased": "biased", "variance": "sure"}
+        pairs |= {b: a for a, b in pairs.items()}
+        return {name: found[pairs.get(name, name)] for name in found}
 
     return other
 
@@ -106,7 +136,6 @@ def in_unit(inputs: Mapping[str, Image], unit: Scalar) -> Inputs:
         radiances divided by the unit, squares by its square, features unchanged.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> one = jnp.ones((1, 1, 1))
         >>> inputs = {"unbiased": one, "variance": one, "depth": one}
         >>> print({n: i.item() for n, i in in_unit(inputs, jnp.asarray(2.0)).items()})
@@ -124,10 +153,23 @@ def _double_shrinkage(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
     return double_shrinkage.neural_inputs(frame, estimate)
 
 
-def _progressive(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
+def _progressive(
+    key: Key,
+    frame: Frame,
+    estimate: Estimate,
+    *,
+    denoise: Callable[[Image, Frame], Any],
+) -> Inputs:
     """Return PD's inputs; denoises anew, since SURE probes the denoiser."""
     del estimate
-    return progressive.neural_inputs(key, oidn.denoise_color, frame)
+    found = progressive.neural_inputs(key, denoise, frame)
+    found.pop("noise", None)  # of the bound, which the network does not see
+    return found
+
+
+def _bilateral(color: Image, frame: Frame) -> Image:
+    """Denoise a colour by a filter that knows the features."""
+    return bilateral.denoise(color, frame.variance, stack(frame))
 
 
 def _kernel_predicting(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
@@ -141,8 +183,15 @@ def _joint(network: networks.Joint, inputs: Mapping[str, Image]) -> Image:
     x, v = inputs["noisy"], inputs["variance"]
     y = kernel_predicting.denoise_inputs(network.denoiser, inputs)
     images = {"unbiased": x, "biased_a": y, "biased_b": y, "variance": v}
-    paper = {"window": 15, "whiten": False}
-    return james_stein.combine_inputs(network.combiner, images, **paper)
+    return james_stein.combine_inputs(network.combiner, images)
+
+
+_DENOISERS = (
+    oidn.denoise_color,
+    functools.partial(oidn.denoise_color, variant=oidn.VARIANTS["oidn-color"]),
+    _bilateral,
+)
+_PD = tuple(functools.partial(_progressive, denoise=each) for each in _DENOISERS)
 
 
 RECIPES = {
@@ -150,41 +199,47 @@ RECIPES = {
         networks.JamesSteinNetwork,
         james_stein.neural_inputs,
         james_stein.combine_inputs,
-        losses.log_l2,
-        functools.partial(james_stein.neural_inputs, choose="opposite"),
+        options={"rule": james_stein.Rule(window=7, whiten=True)},
+        others=(functools.partial(james_stein.neural_inputs, choose="opposite"),),
     ),
     "dsc": Recipe(
         networks.ShrinkageNetwork,
         _double_shrinkage,
         double_shrinkage.combine_inputs,
-        metrics.smape,
+        options={"serves": "denoised"},
+    ),
+    "dsc-photons": Recipe(
+        networks.ShrinkageNetwork,
+        _double_shrinkage,
+        double_shrinkage.combine_inputs,
+        options={"serves": "independent"},
+        estimate="photons",
     ),
     "pd": Recipe(
         networks.MixingNetwork,
-        _progressive,
+        _PD[0],
         progressive.combine_inputs,
-        losses.log_l2,
-        exchanged(_progressive),
-        {"activate": functools.partial(progressive.direct_activation, beyond=0.0)},
+        options={"form": "direct"},
+        others=(*_PD[1:], *map(exchanged, _PD)),
+        training={"bound": False, "limit": False},
     ),
     "kernels": Recipe(
         networks.KernelPredictor,
         _kernel_predicting,
         kernel_predicting.denoise_inputs,
-        losses.log_l2,
     ),
-    "kernels-njs": Recipe(networks.Joint, _kernel_predicting, _joint, losses.log_l2),
+    "kernels-njs": Recipe(networks.Joint, _kernel_predicting, _joint),
 }
-"""Recipes by name. Unlike the papers, as it measured better when both were trained: njs
-has the whitened rule; pd has NJS's loss, alpha as one output of the network, and no
-bound. The last two learn a denoiser, alone and jointly with a combiner."""
+"""Recipes by name. The last two learn a denoiser, alone and jointly with a combiner.
+Unlike the papers njs has the whitened rule, pd has alpha as one output of the network,
+and the loss is one that noisy references do not bias."""
 
 
 def shipped(name: str) -> Network:
     """Return a network with the parameters that come with the package.
 
     Args:
-        name: of its recipe: njs, dsc or pd.
+        name: of its recipe, such as njs.
 
     Returns:
         the network.
@@ -194,23 +249,21 @@ def shipped(name: str) -> Network:
 
     Example:
         >>> network = shipped("pd")
-        >>> print(sum(array.size for array in jax.tree.leaves(network)), "parameters")
-        33609 parameters
+        >>> print(network.form)
+        direct
     """
-    files = {name: WEIGHTS / f"{name}.safetensors" for name in RECIPES}
-    there = [name for name, file in files.items() if file.exists()]
+    there = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
     if name not in there:
         raise ValueError(f"no trained network {name!r}; there are {', '.join(there)}")
-    return load_network(RECIPES[name], files[name])
+    return load_network(RECIPES[name], WEIGHTS / f"{name}.safetensors")
 
 
 def load_network(recipe: Recipe, path: pathlib.Path) -> Network:
-    """Return a network with the parameters of a file.
+    """Return a network with the parameters of a file, for what its card says.
 
     Args:
         recipe: of the network.
-        path: safetensors file. Its card, with the network's size, has the same name
-            with the suffix json.
+        path: safetensors file, beside its card.
 
     Returns:
         the network.
@@ -220,15 +273,56 @@ def load_network(recipe: Recipe, path: pathlib.Path) -> Network:
 
     Example:
         >>> network = load_network(RECIPES["njs"], WEIGHTS / "njs.safetensors")
-        >>> print(type(network).__name__)
-        JamesSteinNetwork
+        >>> print(type(network).__name__, network.rule.window)
+        JamesSteinNetwork 7
+    """
+    options = options_of(read_card(path))
+    like = jax.eval_shape(lambda: recipe.make(jax.random.key(0), **options))
+    return checkpoints.load(path, like)
+
+
+def options_of(card: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a card's network.
+
+    Args:
+        card: from `read_card`.
+
+    Returns:
+        what `Recipe.make` takes.
+
+    Example:
+        >>> print(options_of({"network": {"rule": {"window": 7, "whiten": True}}}))
+        {'rule': Rule(window=7, whiten=True)}
+    """
+    options = dict(card["network"])
+    if "rule" in options:
+        options["rule"] = james_stein.Rule(**options["rule"])
+    return options
+
+
+def read_card(path: pathlib.Path) -> dict[str, Any]:
+    """Return the card of a file of parameters.
+
+    Args:
+        path: safetensors file. Its card has the same name with the suffix json.
+
+    Returns:
+        the card; `network` in it are the options of the network.
+
+    Raises:
+        ValueError: if the card is missing or damaged.
+
+    Example:
+        >>> print(read_card(WEIGHTS / "njs.safetensors")["method"])
+        njs
     """
     card = path.with_suffix(".json")
     try:
-        size = json.loads(card.read_text())["size"]
+        found = json.loads(card.read_text())
+        if isinstance(found["network"], dict):
+            return found
     except FileNotFoundError:
         raise ValueError(f"{card}: no such card of a network") from None
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{card}: not the card of a network: {error}") from None
-    like = jax.eval_shape(lambda: recipe.network(jax.random.key(0), size=size))
-    return checkpoints.load(path, like)
+    raise ValueError(f"{card}: not the card of a network: `network` is no object")

@@ -18,10 +18,11 @@ from jaxtyping import Array, Float
 
 from jscomb.typing import Image, Key, Scalar
 
-__all__ = ["Examples", "Schedule", "State", "draw", "evaluate", "run", "start"]
+__all__ = ["Crop", "Examples", "Schedule", "State", "draw", "evaluate", "run", "start"]
 
 Network = Any  # a pytree of parameters that can be called
-Objective = Callable[[Network, dict[str, Image], Image, Scalar], Scalar]
+Halves = Float[Array, "2 h w c"]
+Objective = Callable[[Network, dict[str, Image], Halves, Scalar], Scalar]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +56,29 @@ class Examples(NamedTuple):
 
     Attributes:
         inputs: of a recipe, normalised, [N,V,H,W,C] each; V variants of each frame.
-        reference: normalised radiance, [N,H,W,3].
+        halves: of the references, normalised radiance, [N,2,H,W,3].
+        weight: of each frame's loss, [N].
     """
 
     inputs: dict[str, Float[Array, "n v h w _"]]
-    reference: Float[Array, "n h w c"]
+    halves: Float[Array, "n 2 h w c"]
+    weight: Float[Array, " n"]
+
+
+class Crop(NamedTuple):
+    """A part of a frame to learn from.
+
+    Attributes:
+        inputs: of a recipe, [H,W,C] each.
+        halves: of the reference, [2,H,W,3].
+        unit: of radiance, to measure both in.
+        weight: of the loss.
+    """
+
+    inputs: dict[str, Image]
+    halves: Halves
+    unit: Scalar
+    weight: Scalar
 
 
 class State(NamedTuple):
@@ -101,8 +120,8 @@ def run(
     """Train from a state to the end of the schedule.
 
     Args:
-        objective: loss of a network, the inputs and the reference of a crop, and the
-            unit of radiance to measure both in.
+        objective: loss of a network, the inputs and the reference's halves of a crop,
+            and the unit of radiance to measure both in.
         state: to start from.
         examples: to draw crops from.
         schedule: how to train.
@@ -115,15 +134,17 @@ def run(
 
     Example:
         >>> x = jnp.ones((1, 1, 4, 4, 3))
-        >>> examples = Examples({"x": x}, 2 * x[0])
-        >>> loss = lambda gain, inputs, r, _: jnp.mean((gain * inputs["x"] - r) ** 2)
+        >>> r = 2 * jnp.ones((1, 2, 4, 4, 3))
+        >>> examples = Examples({"x": x}, r, jnp.ones(1))
+        >>> def loss(gain, inputs, halves, unit):
+        ...     return jnp.mean((gain * inputs["x"] - halves[0]) ** 2)
         >>> schedule = Schedule(steps=200, batch=1, crop=2, rate=0.1)
         >>> first = start(jnp.ones(()), schedule)
         >>> *_, (last, value) = run(loss, first, examples, schedule)
         >>> print(f"{last.step} {last.network:.2f}")
         200 2.00
     """
-    size = examples.reference.shape[1:3]
+    size = examples.halves.shape[2:4]
     if schedule.crop > min(size):
         raise ValueError(f"crops of {schedule.crop} do not fit frames of {size}")
     optimiser = schedule.optimiser()
@@ -164,20 +185,19 @@ def evaluate(
 
     Example:
         >>> x = jnp.ones((2, 1, 4, 4, 3))
-        >>> examples = Examples({"x": x}, 2 * x[:, 0])
-        >>> loss = lambda gain, inputs, r, _: jnp.mean((gain * inputs["x"] - r) ** 2)
+        >>> examples = Examples({"x": x}, 2 * jnp.ones((2, 2, 4, 4, 3)), jnp.ones(2))
+        >>> def loss(gain, inputs, halves, unit):
+        ...     return jnp.mean((gain * inputs["x"] - halves[0]) ** 2)
         >>> print(evaluate(loss, jnp.array(1.5), examples))
         [0.25 0.25]
     """
-    one = jnp.ones((), examples.reference.dtype)
+    one = jnp.ones((), examples.halves.dtype)
     first = {name: array[:, 0] for name, array in examples.inputs.items()}
     of_frame = lambda frame: objective(network, frame[0], frame[1], one)
-    return lax.map(of_frame, (first, examples.reference), batch_size=4)
+    return lax.map(of_frame, (first, examples.halves), batch_size=4)
 
 
-def draw(
-    key: Key, examples: Examples, schedule: Schedule
-) -> tuple[dict[str, Image], Image, Scalar]:
+def draw(key: Key, examples: Examples, schedule: Schedule) -> Crop:
     """Draw a crop of a frame, with random flips, transposition and order of channels.
 
     Args:
@@ -186,18 +206,18 @@ def draw(
         schedule: sets the crop's size and the range of the unit.
 
     Returns:
-        the crop's inputs and reference, and a unit of radiance to measure both in.
+        the crop.
 
     Example:
-        >>> x = jnp.ones((2, 1, 8, 8, 3))
-        >>> examples, schedule = Examples({"x": x}, x[:, 0]), Schedule(crop=4)
-        >>> crop = jax.jit(draw, static_argnames="schedule")
-        >>> inputs, reference, _ = crop(jax.random.key(0), examples, schedule=schedule)
-        >>> print(inputs["x"].shape, reference.shape)
-        (4, 4, 3) (4, 4, 3)
+        >>> x = jnp.ones((2, 2, 8, 8, 3))
+        >>> examples, schedule = Examples({"x": x}, x, jnp.ones(2)), Schedule(crop=4)
+        >>> cut = jax.jit(draw, static_argnames="schedule")
+        >>> crop = cut(jax.random.key(0), examples, schedule=schedule)
+        >>> print(crop.inputs["x"].shape, crop.halves.shape)
+        (4, 4, 3) (2, 4, 4, 3)
     """
     which, variant, corner, turns, colours, unit = jax.random.split(key, 6)
-    frames, height, width, _ = examples.reference.shape
+    frames, _, height, width, _ = examples.halves.shape
     frame = jax.random.randint(which, (), 0, frames)
     size = schedule.crop
     ends = jnp.array([height - size + 1, width - size + 1])
@@ -207,19 +227,20 @@ def draw(
     variants = next(iter(examples.inputs.values())).shape[1]
     way = jax.random.randint(variant, (), 0, variants)
 
-    def cut(array: Array, *place: Array) -> Image:
-        c = array.shape[-1]
-        at = (*place, row, column, jnp.zeros_like(row))
-        sizes = (*(1 for _ in place), size, size, c)
-        image = lax.dynamic_slice(array, at, sizes).reshape(size, size, c)
-        image = jnp.where(flip_rows, image[::-1], image)
-        image = jnp.where(flip_columns, image[:, ::-1], image)
-        image = jnp.where(transposed, image.swapaxes(0, 1), image)
+    def cut(array: Array) -> Array:
+        """A frame's images at the place, [V,size,size,C]."""
+        v, c = array.shape[1], array.shape[-1]
+        at = (frame, jnp.zeros_like(row), row, column, jnp.zeros_like(row))
+        image = lax.dynamic_slice(array, at, (1, v, size, size, c))[0]
+        image = jnp.where(flip_rows, image[:, ::-1], image)
+        image = jnp.where(flip_columns, image[:, :, ::-1], image)
+        image = jnp.where(transposed, image.swapaxes(1, 2), image)
         return image[..., order] if c == 3 else image
 
-    inputs = {name: cut(array, frame, way) for name, array in examples.inputs.items()}
-    off = jax.random.uniform(unit, (), examples.reference.dtype, -1.0, 1.0)
-    return inputs, cut(examples.reference, frame), 2 ** (schedule.jitter * off)
+    inputs = {name: cut(array)[way] for name, array in examples.inputs.items()}
+    off = jax.random.uniform(unit, (), examples.halves.dtype, -1.0, 1.0)
+    unit_drawn = 2 ** (schedule.jitter * off)
+    return Crop(inputs, cut(examples.halves), unit_drawn, examples.weight[frame])
 
 
 def _batch_loss(
@@ -230,5 +251,9 @@ def _batch_loss(
     schedule: Schedule,
 ) -> Scalar:
     """Return the mean loss of one crop a key."""
-    one = lambda key: objective(network, *draw(key, examples, schedule))
+
+    def one(key: Key) -> Scalar:
+        crop = draw(key, examples, schedule)
+        return crop.weight * objective(network, crop.inputs, crop.halves, crop.unit)
+
     return jnp.mean(jax.vmap(one)(keys))

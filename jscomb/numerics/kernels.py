@@ -25,6 +25,11 @@ from jscomb.typing import Image, Mask
 
 __all__ = ["Kernels", "kernel_mean", "predicted_mean"]
 
+_ROWS, _WEIGHTS = (
+    16,
+    2**22,
+)  # of a strip: at least so many rows, or about so many weights
+
 
 class Kernels(NamedTuple):
     """Kernels of all pixels, to be evaluated a strip of rows at a time.
@@ -33,11 +38,13 @@ class Kernels(NamedTuple):
         features: input of the head, shape [H,W,F].
         head: from a strip of features, [t+2*reach,W,F], to weights [t,W,K].
         reach: rows around a strip that its weights depend on.
+        window: width of the windows in pixels, odd.
     """
 
     features: Image
     head: Callable[[Array], Array]
     reach: int
+    window: int
 
 
 def kernel_mean(
@@ -81,7 +88,6 @@ def kernel_mean(
 def predicted_mean(
     images: Float[Array, "n h w c"],
     kernels: Kernels,
-    window: int,
     *,
     mask: Mask | None = None,
 ) -> Float[Array, "n h w c"]:
@@ -90,24 +96,24 @@ def predicted_mean(
     Args:
         images: each with its own kernels, shape [N,H,W,C].
         kernels: N w² weights a pixel, one image after another.
-        window: width w in pixels, odd.
         mask: pixels to include, shape [H,W,1]; None for all.
 
     Returns:
         the means, shape [N,H,W,C]; 0 where all included pixels have weight 0.
 
     Raises:
-        ValueError: if `window` is even or below one, or there are not N w² weights.
+        ValueError: if the window is even or below one, or there are not N w² weights.
 
     Example:
         >>> image = jnp.array([1.0, 2.0, 6.0]).reshape(1, 3, 1)
         >>> even = lambda near: jnp.ones((*near.shape[:2], 9))
-        >>> (mean,) = predicted_mean(image[None], Kernels(image, even, 0), 3)
+        >>> (mean,) = predicted_mean(image[None], Kernels(image, even, 0, 3))
         >>> print([f"{value:.2f}" for value in mean.ravel()])
         ['1.50', '3.00', '4.00']
     """
-    n, _, _, c = images.shape
-    r = check_window(window) // 2
+    n, _, width, c = images.shape
+    window = check_window(kernels.window)
+    r = window // 2
     padded = jnp.pad(_counted(images, mask), ((0, 0), (r, r), (0, 0)))
 
     def strip(features: Array, near: Array) -> Array:
@@ -124,7 +130,8 @@ def predicted_mean(
             means.append(_mean(_weighted_sum(near[..., channels], kernel, window)))
         return jnp.concatenate(means, axis=-1)
 
-    mean = map_rows(strip, [(kernels.features, kernels.reach), (padded, r)])
+    rows = max(_ROWS, _WEIGHTS // (width * n * window**2))
+    mean = map_rows(strip, [(kernels.features, kernels.reach), (padded, r)], rows=rows)
     return jnp.stack(jnp.split(mean, n, axis=-1))
 
 

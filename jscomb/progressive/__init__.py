@@ -27,8 +27,8 @@ Source: A. Firmino, J. Frisvad, H. Jensen, "Progressive Denoising of Monte Carlo
 Rendered Images", 2022 (PD; eq. numbers above and in the functions).
 """
 
-from jscomb.progressive._combine import bound_mixing, combine
-from jscomb.progressive._estimate import mixing, risk
+from jscomb.progressive._combine import bound_mixing, bound_sigma, combine
+from jscomb.progressive._estimate import channel_variance, mixing, risk
 from jscomb.progressive._frame import (
     NEEDS,
     combine_frame,
@@ -37,6 +37,7 @@ from jscomb.progressive._frame import (
     plan_neural,
 )
 from jscomb.progressive._neural import (
+    FORMS,
     activation,
     combine_inputs,
     direct_activation,
@@ -44,9 +45,12 @@ from jscomb.progressive._neural import (
 )
 
 __all__ = [
+    "FORMS",
     "NEEDS",
     "activation",
     "bound_mixing",
+    "bound_sigma",
+    "channel_variance",
     "combine",
     "combine_frame",
     "combine_inputs",

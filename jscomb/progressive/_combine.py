@@ -15,11 +15,15 @@ from jscomb.numerics.guards import (
 )
 from jscomb.numerics.windows import at_window_max, check_window, separable_sum
 from jscomb.progressive._estimate import mixing
-from jscomb.typing import Image, Variance
+from jscomb.typing import Image, Scalar, Variance
 
 Mixing = Callable[[Image, Image, Variance, Image], Image]
 
 _NARROWEST, _WIDEST = 1e-3, 100.0  # of the bound's Gaussian, in pixels
+
+BOUND_WINDOW = 11  # width of the bound's windows in pixels
+
+Noise = Float[Array, "h w 1"]
 
 
 def combine(
@@ -30,6 +34,8 @@ def combine(
     *,
     mix: Mixing | None = None,
     bound: bool = True,
+    noise: Noise | None = None,
+    sigma: Scalar | None = None,
 ) -> Image:
     """Mix a rendering and its denoised image.
 
@@ -44,6 +50,8 @@ def combine(
         mix: from these four arrays to alpha in [0, 1], such as a network; None for
             `mixing`.
         bound: lower alpha where the mix is not consistent with the noise.
+        noise: as for `bound_mixing`.
+        sigma: as for `bound_mixing`.
 
     Returns:
         z, linear radiance, shape [H,W,C]; at an invalid pixel the first finite of
@@ -63,7 +71,9 @@ def combine(
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
     alpha = (mix or mixing)(unbiased, biased, variance, sure)
     if bound:
-        alpha = bound_mixing(alpha, unbiased, biased, variance)
+        alpha = bound_mixing(
+            alpha, unbiased, biased, variance, noise=noise, sigma=sigma
+        )
     valid, x, y, _, _ = zero_invalid(unbiased, biased, variance, sure)
     # As a blend, not x + alpha (y - x), so that 0 and 1 are exact.
     blend = (1 - alpha) * x + alpha * y
@@ -76,7 +86,9 @@ def bound_mixing(
     biased: Image,
     variance: Variance,
     *,
-    window: int = 11,
+    noise: Noise | None = None,
+    sigma: Scalar | None = None,
+    window: int = BOUND_WINDOW,
     strength: float = 2.0,
     shift: float = 4.2,
 ) -> Image:
@@ -91,6 +103,11 @@ def bound_mixing(
         unbiased: x, linear radiance, shape [H,W,C].
         biased: y, linear radiance, shape [H,W,C].
         variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        noise: variance of the channels' mean of x, squared radiance, at least zero,
+            shape [H,W,1], such as `channel_variance` estimates; None for the paper's,
+            which is right for independent channels.
+        sigma: width of the Gaussian in pixels; None for `bound_sigma` of these images,
+            which crops of an image do not know.
         window: width of the windows in pixels, odd.
         strength: a, how steeply the bound sets in.
         shift: c, the number of standard deviations where it does.
@@ -112,33 +129,67 @@ def bound_mixing(
         0.374
         0.009
 
-    Source: PD eq. 12-18. The width of the Gaussian there is absolute; here it is
-    relative to the mean radiance, which is the same for normalised images.
+    Source: PD eq. 12-18.
     """
     check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased, variance=variance)
     valid, alpha, x, y, v = zero_invalid(mixing, unbiased, biased, variance)
-    channels = x.shape[-1]
+    if sigma is None:
+        sigma = bound_sigma(unbiased, variance, noise=noise)
     moved = jnp.mean(alpha * (y - x), axis=-1, keepdims=True)
-    noise = jnp.sum(v, axis=-1, keepdims=True) / channels**2
+    noise = _of_mean(v) if noise is None else jnp.where(valid, noise, 0.0)
     largest = at_window_max(
         noise, jnp.concatenate([moved, noise], axis=-1), window, mask=valid
     )
     # Both are 0 at invalid pixels; masked again they would not be fused.
-    count = jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
-    radiance = jnp.sum(jnp.abs(x)) / (count * channels)
-    kernel = _kernel(jnp.sum(noise) / count, radiance, window)
+    kernel = _kernel(sigma, window)
     mean = largest[..., :1] + separable_sum(moved, kernel)
     error = largest[..., 1:] + separable_sum(noise, jnp.square(kernel))
     t = _magnitude(mean, error)
     return jnp.where(valid, alpha * ndtr(strength * (shift - t)), 0.0)
 
 
-def _kernel(noise: Array, radiance: Array, window: int) -> Float[Array, " taps"]:
+def bound_sigma(
+    unbiased: Image, variance: Variance, *, noise: Noise | None = None
+) -> Scalar:
+    """Return the width of the bound's Gaussian: the narrower the less noise there is.
+
+    Args:
+        unbiased: x, linear radiance, shape [H,W,C].
+        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        noise: as for `bound_mixing`.
+
+    Returns:
+        100 times the relative deviation of the frame, in pixels, from 0.001 to 100.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> x = jnp.ones((2, 2, 3))
+        >>> print(bound_sigma(x, 3e-4 * x).round(3))
+        1.0
+
+    Source: PD eq. 15. The width there is absolute; here it is relative to the mean
+    radiance, which is the same for normalised images.
+    """
+    check_same_shape(unbiased=unbiased, variance=variance)
+    valid, x, v = zero_invalid(unbiased, variance)
+    noise = _of_mean(v) if noise is None else jnp.where(valid, noise, 0.0)
+    count = jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
+    radiance = jnp.sum(jnp.abs(jnp.mean(x, axis=-1))) / count
+    square = divide(jnp.sum(noise) / count, jnp.square(radiance), where=radiance > 0)
+    return jnp.clip(_WIDEST * safe_sqrt(square), _NARROWEST, _WIDEST)
+
+
+def _of_mean(variance: Variance) -> Noise:
+    """Variance of the mean of independent channels."""
+    return jnp.sum(variance, axis=-1, keepdims=True) / variance.shape[-1] ** 2
+
+
+def _kernel(sigma: Scalar, window: int) -> Float[Array, " taps"]:
     """Along one axis: rows times columns are the weights of eq. 15."""
-    square = divide(noise, jnp.square(radiance), where=radiance > 0)
-    sigma = jnp.clip(_WIDEST * safe_sqrt(square), _NARROWEST, _WIDEST)
     r = check_window(window) // 2
-    offsets = jnp.arange(-r, r + 1, dtype=noise.dtype)
+    offsets = jnp.arange(-r, r + 1, dtype=sigma.dtype)
     shape = jnp.exp(-jnp.square(offsets / sigma) / 2)
     return shape / jnp.sqrt(sigma * (2 * jnp.pi) ** 0.5)
 

@@ -1,6 +1,7 @@
-"""The mixing of minimum error and its risk, from SURE."""
+"""The mixing of minimum error and its risk, from SURE, and noise between channels."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, zero_invalid
 from jscomb.numerics.windows import window_sum
@@ -94,3 +95,47 @@ def risk(
     divergence = (s - jnp.square(y - x) + v) / 2
     beta = 1 - alpha
     return beta**2 * v + alpha**2 * s + 2 * alpha * beta * divergence
+
+
+def channel_variance(
+    half_a: Image, half_b: Image, variance: Variance, *, window: int = 15
+) -> Float[Array, "h w 1"]:
+    """Estimate the variance of the channels' mean, by how alike the channels' noise is.
+
+    A path is bright in all channels at once, so their noise is correlated, and the mean
+    of C channels has up to C times the variance that it had if they were independent.
+    The factor is estimated from the difference d of the halves, over windows:
+    sum((sum_c d_c)^2 / v) / sum(sum_c d_c^2 / v), which is from 0 to C.
+
+    Args:
+        half_a: x of half a, linear radiance, shape [H,W,C].
+        half_b: x of half b, same shape.
+        variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
+        window: width of the windows in pixels, odd.
+
+    Returns:
+        the variance, squared radiance, shape [H,W,1]; 0 at invalid pixels.
+
+    Raises:
+        ValueError: while tracing, if shapes differ or `window` is even.
+
+    Example:
+        >>> grey, v = jnp.ones((2, 2, 3)), jnp.full((2, 2, 3), 0.03)
+        >>> print(channel_variance(grey, -grey, v)[0, 0].round(3))  # one noise for all
+        [0.03]
+
+    Source: PD section 4.2 takes the channels as independent, a third of this one.
+    """
+    check_same_shape(half_a=half_a, half_b=half_b, variance=variance)
+    valid, a, b, v = zero_invalid(half_a, half_b, variance)
+    d, over_channels = a - b, {"axis": -1, "keepdims": True}
+    energy, total = jnp.sum(jnp.square(d), **over_channels), jnp.sum(v, **over_channels)
+    # Relative to the variance, so that bright pixels do not decide for their windows.
+    alike, each = (
+        window_sum(divide(e, total, where=total > 0), window)
+        for e in (jnp.square(jnp.sum(d, **over_channels)), energy)
+    )
+    # Where the halves are equal nothing is known, and the most is assumed.
+    c = float(d.shape[-1])
+    factor = divide(alike, each, where=each > 0, otherwise=c)
+    return jnp.where(valid, factor * total / c**2, 0.0)

@@ -6,7 +6,7 @@ guided by the frame's features, and has forward derivatives in the colour, such 
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -15,8 +15,9 @@ from jscomb.frame import Estimate, Frame, Needs, with_halves
 from jscomb.numerics.sure import monte_carlo_sure
 from jscomb.numerics.tiles import Local, compiled, network_plan
 from jscomb.numerics.variances import robust_variance
-from jscomb.progressive._combine import combine
-from jscomb.progressive._estimate import mixing
+from jscomb.numerics.windows import reach_of
+from jscomb.progressive._combine import BOUND_WINDOW, bound_sigma, combine
+from jscomb.progressive._estimate import channel_variance, mixing
 from jscomb.progressive._neural import Network, combine_inputs
 from jscomb.typing import Image, Key
 
@@ -59,14 +60,13 @@ def combine_frame(
     frame.require("progressive", NEEDS)
     mix = compiled(_mix, bound=bound)
     inputs = lambda part: neural_inputs(jax.random.clone(key), denoise, part)
-    make = lambda part: mix(*inputs(part).values())
+    make = lambda part: mix(inputs(part))
     return with_halves(frame, make, needs=NEEDS)
 
 
-def _mix(x: Image, y: Image, v: Image, s: Image, *, bound: bool) -> Image:
+def _mix(inputs: Mapping[str, Image], *, bound: bool) -> Image:
     """Mix by whitened windows."""
-    mix = functools.partial(mixing, whiten=True)
-    return combine(x, y, v, s, mix=mix, bound=bound)
+    return combine(**inputs, mix=functools.partial(mixing, whiten=True), bound=bound)
 
 
 def neural_combine_frame(
@@ -97,7 +97,7 @@ def neural_combine_frame(
         >>> print(made.image.std() < 0.5 * frame.color.std())
         True
 
-    Source: PD eq. 11, 19; alpha as one output and no bound.
+    Source: PD eq. 11-19; alpha in the form that the network was trained for.
     """
     frame.require("pd", NEEDS)
     plan = lambda part: plan_neural(jax.random.clone(key), denoise, network, part)
@@ -132,7 +132,11 @@ def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> L
         ['unbiased', 'biased', 'variance', 'sure']
     """
     inputs = neural_inputs(key, denoise, frame)
-    return network_plan(combine_inputs, network, inputs)
+    x, v, noise = (inputs.get(name) for name in ("unbiased", "variance", "noise"))
+    sigma = compiled(bound_sigma)(x, v, noise=noise)
+    around = reach_of(BOUND_WINDOW)
+    more = {"sigma": sigma}
+    return network_plan(combine_inputs, network, inputs, around=around, more=more)
 
 
 def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
@@ -144,7 +148,8 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
         frame: normalised, with variance.
 
     Returns:
-        x, y, robust variance and SURE, named as by `neural_combine`, in its order.
+        x, y, robust variance and SURE, and the noise of the channels' mean if there
+        are half buffers, named as by `neural_combine`, in its order.
 
     Raises:
         ValueError: if the frame has no variance or is not normalised.
@@ -163,4 +168,8 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
     x, v = frame.color, robust_variance(frame.variance)
     one = lambda color: denoise(color, frame)
     y, s, _ = monte_carlo_sure(key, one, x, v, slope_limit=_SLOPE_LIMIT)
-    return {"unbiased": x, "biased": y, "variance": v, "sure": s}
+    inputs = {"unbiased": x, "biased": y, "variance": v, "sure": s}
+    if frame.sub_buffers > 1:
+        a, b = (half.color for half in frame.halves())
+        inputs["noise"] = compiled(channel_variance)(a, b, v)
+    return inputs

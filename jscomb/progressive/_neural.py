@@ -1,5 +1,6 @@
 """The mix with a network's alpha."""
 
+import types
 from collections.abc import Callable, Mapping
 
 import jax
@@ -8,22 +9,25 @@ from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, zero_invalid
 from jscomb.numerics.luminance import at_unit_luminance
-from jscomb.progressive._combine import combine
-from jscomb.typing import Image, Variance
+from jscomb.progressive._combine import Noise, combine
+from jscomb.typing import Image, Scalar, Variance
+
+_BEYOND = 0.02  # by which the logistic function passes 0 and 1
 
 Outputs = Float[Array, "h w 3 c"]
 Network = Callable[[Image, Image, Variance, Image], Outputs]
-Activation = Callable[[Outputs], Image]
 
 
-def activation(outputs: Outputs) -> Image:
+def activation(outputs: Outputs, *, limit: bool = True) -> Image:
     """Return alpha from a network's outputs, in the form of eq. 9.
 
     Args:
         outputs: xi_1, xi_2, xi_3 of each channel, shape [H,W,3,C].
+        limit: clip to [0, 1]; not for training, since what is clipped has no
+            derivative.
 
     Returns:
-        clip((xi_1 - xi_2) / max(xi_3, 1e-6), 0, 1), shape [H,W,C].
+        (xi_1 - xi_2) / max(xi_3, 1e-6), limited, shape [H,W,C].
 
     Example:
         >>> outputs = jnp.array([0.5, 0.25, 1.0]).reshape(1, 1, 3, 1)
@@ -33,20 +37,21 @@ def activation(outputs: Outputs) -> Image:
     Source: PD eq. 19.
     """
     first, second, third = (outputs[:, :, k] for k in range(3))
-    return jnp.clip((first - second) / jnp.maximum(third, 1e-6), 0.0, 1.0)
+    share = (first - second) / jnp.maximum(third, 1e-6)
+    return jnp.clip(share, 0.0, 1.0) if limit else share
 
 
-def direct_activation(outputs: Outputs, *, beyond: float = 0.02) -> Image:
+def direct_activation(outputs: Outputs, *, limit: bool = True) -> Image:
     """Return alpha from the first output alone, without the form of eq. 9.
 
     Args:
         outputs: xi_1 and two unused outputs, shape [H,W,3,C].
-        beyond: e, by which the logistic function is stretched before it is clipped, so
-            that it reaches 0 and 1: a thousandth of a firefly is still one. 0 for
-            training, since what is clipped has no derivative.
+        limit: stretch the logistic function by 2 % at both ends and clip, so that it
+            reaches 0 and 1: a thousandth of a firefly is still one. Not for training,
+            since what is clipped has no derivative.
 
     Returns:
-        clip((1 + 2 e) sigmoid(xi_1) - e, 0, 1), shape [H,W,C].
+        sigmoid(xi_1), limited: clip(1.04 sigmoid(xi_1) - 0.02, 0, 1); shape [H,W,C].
 
     Example:
         >>> first = jnp.array([-10.0, 0.0, 10.0]).reshape(1, 3, 1, 1)
@@ -57,7 +62,11 @@ def direct_activation(outputs: Outputs, *, beyond: float = 0.02) -> Image:
     Source: PD table 4.
     """
     share = jax.nn.sigmoid(outputs[:, :, 0])
-    return jnp.clip((1 + 2 * beyond) * share - beyond, 0.0, 1.0)
+    return jnp.clip((1 + 2 * _BEYOND) * share - _BEYOND, 0.0, 1.0) if limit else share
+
+
+FORMS = types.MappingProxyType({"quotient": activation, "direct": direct_activation})
+"""Alpha from a network's outputs, by the network's attribute `form`."""
 
 
 def neural_combine(
@@ -67,8 +76,8 @@ def neural_combine(
     variance: Variance,
     sure: Image,
     *,
-    activate: Activation = activation,
     bound: bool = True,
+    noise: Noise | None = None,
 ) -> Image:
     """Mix a rendering and its denoised image by a network's alpha.
 
@@ -76,14 +85,15 @@ def neural_combine(
     parameters.
 
     Args:
-        network: of x, y, v and s, finite and normalised, to what `activate`
-            takes, such as `learning.networks.MixingNetwork`.
+        network: of x, y, v and s, finite and normalised, to what `activation` takes,
+            such as `learning.networks.MixingNetwork`; or what another of `FORMS` takes,
+            if its attribute `form` says so.
         unbiased: x, linear radiance, shape [H,W,C].
         biased: y, same shape.
         variance: v of the mean x, squared radiance, at least zero, same shape.
         sure: s, squared radiance, same shape.
-        activate: alpha from the outputs: `activation` or `direct_activation`.
         bound: lower alpha where the mix is not consistent with the noise.
+        noise: variance of the channels' mean, as for `bound_mixing`.
 
     Returns:
         z, linear radiance, shape [H,W,C]; at an invalid pixel the first finite of
@@ -102,11 +112,13 @@ def neural_combine(
     Source: PD eq. 11, 18, 19.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
-    names = "unbiased", "biased", "variance", "sure"
+    names = ["unbiased", "biased", "variance", "sure"]
+    squares = [variance, sure]
+    if noise is not None:
+        names, squares = [*names, "noise"], [*squares, noise]
     normalised = lambda *images: combine_inputs(
-        network, dict(zip(names, images, strict=True)), activate=activate, bound=bound
+        network, dict(zip(names, images, strict=True)), bound=bound
     )
-    squares = variance, sure
     return at_unit_luminance(normalised, unbiased, biased, squares=squares)
 
 
@@ -114,19 +126,22 @@ def combine_inputs(
     network: Network,
     inputs: Mapping[str, Image],
     *,
-    activate: Activation = direct_activation,
-    bound: bool = False,
+    bound: bool = True,
+    limit: bool = True,
+    sigma: Scalar | None = None,
 ) -> Image:
     """Mix normalised images by name, for crops of a frame and for training.
 
-    Not scale-equivariant, and local without the bound: `neural_combine` without its
-    normalisation.
+    Not scale-equivariant, and local with a given sigma or without the bound:
+    `neural_combine` without its normalisation.
 
     Args:
         network: as for `neural_combine`.
-        inputs: unbiased, biased, variance and sure, as `neural_inputs` makes.
-        activate: alpha from the network's outputs.
+        inputs: unbiased, biased, variance and sure, and noise if it is known, as
+            `neural_inputs` makes.
         bound: lower alpha where the mix is not consistent with the noise.
+        limit: alpha to [0, 1]; not for training.
+        sigma: of the bound, see `bound_sigma`; None for that of these images.
 
     Returns:
         z, normalised radiance, shape [H,W,C]; at an invalid pixel the first finite of
@@ -140,14 +155,15 @@ def combine_inputs(
         >>> network = lambda *_: jnp.zeros((1, 1, 3, 1))
         >>> names = "unbiased", "biased", "variance", "sure"
         >>> inputs = dict(zip(names, map(at, (3.0, 1.0, 1.0, 2.0))))
-        >>> print(combine_inputs(network, inputs).item())
-        2.0
+        >>> print(combine_inputs(network, inputs, bound=False).item())
+        3.0
 
-    Source: PD eq. 11, 18, 19; alpha as one output and no bound measured better.
+    Source: PD eq. 11, 18, 19.
     """
+    activate = FORMS[getattr(network, "form", "quotient")]
 
     def mix(*images: Image) -> Image:
         _, x, y, v, s = zero_invalid(*images)
-        return activate(network(x, y, v, s))
+        return activate(network(x, y, v, s), limit=limit)
 
-    return combine(**inputs, mix=mix, bound=bound)
+    return combine(**inputs, mix=mix, bound=bound, sigma=sigma)

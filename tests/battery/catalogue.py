@@ -158,6 +158,7 @@ def combiners() -> dict[str, Entry]:
     )
     keys = jax.random.split(jax.random.key(0), len(kinds))
     njs, dsc, pd = (n(key, size="light") for n, key in zip(kinds, keys, strict=True))
+    njs.rule, pd.form = james_stein.Rule(window=7, whiten=True), "direct"
     xyv = lambda r: (r.unbiased, r.biased, r.variance)
     halves = lambda r: (r.unbiased_a, r.unbiased_b, r.biased_a, r.biased_b)
     known = lambda r: finite(r.unbiased, r.biased)  # so that derivatives are, too
@@ -242,6 +243,7 @@ def combiners() -> dict[str, Entry]:
                         "variance": r.variance,
                         "sure": risk(r),
                     },
+                    bound=False,
                 )
             ),
             pd.reach,

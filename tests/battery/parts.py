@@ -66,8 +66,8 @@ def _predicted(r: Rendering) -> jax.Array:
         steps = jnp.linspace(0, 1, count, dtype=strip.dtype)
         return jnp.exp(-strip[..., :1] * steps[None, None])
 
-    made = kernels.Kernels(r.features, head, 0)
-    return kernels.predicted_mean(r.unbiased[None], made, WINDOW)
+    made = kernels.Kernels(r.features, head, 0, WINDOW)
+    return kernels.predicted_mean(r.unbiased[None], made)
 
 
 def _convolved(r: Rendering) -> jax.Array:
@@ -142,6 +142,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
     weights = lambda r: jnp.stack([share(r), share(r), 1 - 2 * share(r)])
     return {
         "james_stein.risk": lambda r: james_stein.risk(*_of_radiance(r)),
+        "james_stein.risk_bound": lambda r: james_stein.risk_bound(
+            r.biased, r.variance, r.variance / 2
+        ),
         "james_stein.smooth_variance": lambda r: james_stein.smooth_variance(
             r.variance
         ),
@@ -166,6 +169,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         "double_shrinkage.biased_error": (
             lambda r: double_shrinkage.biased_error(*_of_halves(r))
         ),
+        "double_shrinkage.dependence": (
+            lambda r: double_shrinkage.dependence(*r[:4]).correlation
+        ),
         "double_shrinkage.confidence": lambda r: double_shrinkage.confidence(
             r.biased, *_of_radiance(r), shared(r)
         ),
@@ -178,6 +184,12 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         "progressive.mixing": lambda r: progressive.mixing(*_of_radiance(r), _sure(r)),
         "progressive.bound_mixing": lambda r: progressive.bound_mixing(
             share(r), *_of_radiance(r)
+        ),
+        "progressive.bound_sigma": (
+            lambda r: progressive.bound_sigma(r.unbiased, r.variance)
+        ),
+        "progressive.channel_variance": lambda r: progressive.channel_variance(
+            *r[:2], r.variance
         ),
         "progressive.risk": lambda r: progressive.risk(
             share(r), *_of_radiance(r), _sure(r)

@@ -13,6 +13,7 @@ ELSEWHERE = {
             for name in ("denoise_frame", "plan_frame", "reach")
         ),
         "double_shrinkage.combine_frame",
+        "double_shrinkage.depends",
         "double_shrinkage.make_inputs",
         "double_shrinkage.neural_combine_frame",
         "double_shrinkage.neural_inputs",
@@ -56,6 +57,7 @@ ELSEWHERE = {
     "what is here with normalisation, or without": {
         "double_shrinkage.neural_combine",
         "james_stein.neural_combine",
+        "james_stein.neural_combine_dual",
         "kernel_predicting.denoise",
         "oidn.denoise_normalised",
         "progressive.neural_combine",
@@ -72,7 +74,7 @@ ELSEWHERE = {
         "simplex.reference_quadratic",
     },
     "of features, which have no unit": {"oidn.denoise_feature"},
-    "not of images": {"oidn.available", "oidn.pretrained"},
+    "not of images": {"james_stein.rule_of", "oidn.available", "oidn.pretrained"},
 }
 ROOMS = (
     *("james_stein", "ensemble", "uncorrelated", "double_shrinkage", "progressive"),

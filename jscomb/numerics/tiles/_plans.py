@@ -1,6 +1,7 @@
 """A network's combination as a local function."""
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from jscomb.numerics.tiles._crops import Local
@@ -12,18 +13,19 @@ def network_plan(
     network: Any,
     inputs: Mapping[str, Any],
     *,
-    kernel: int = 1,
     around: int = 0,
+    more: Mapping[str, Any] = MappingProxyType({}),
 ) -> Local:
     """Return what a network makes of its inputs as a local function of them.
 
     Args:
-        combine: of the network and its inputs.
-        network: pytree of parameters with `reach` and `multiple`; without them the
-            combination depends on the whole image.
+        combine: of the network, its inputs and more.
+        network: pytree of parameters with `reach`, `multiple` and, if it predicts
+            kernels, their width `window`; without a reach the combination depends on
+            the whole image.
         inputs: images [H,W,*] by name.
-        kernel: width in pixels of the kernels that the network predicts.
         around: pixels that the combination sees around the network's outputs.
+        more: arrays that are the same for all crops, by the combination's keywords.
 
     Returns:
         the function; compiled once for all networks of one shape.
@@ -36,7 +38,7 @@ def network_plan(
     """
     reach = getattr(network, "reach", None)
     if reach is None:
-        return Local(lambda images: combine(network, images), dict(inputs), None)
-    function = lambda images: compiled(combine)(network, images)
-    halo = max(reach, kernel // 2) + around
+        return Local(lambda i: combine(network, i, **more), dict(inputs), None)
+    function = lambda images: compiled(combine)(network, images, **more)
+    halo = max(reach, getattr(network, "window", 1) // 2) + around
     return Local(function, dict(inputs), halo, network.multiple)
