@@ -28,7 +28,7 @@ def examples(rng):
     reference = jnp.asarray(rng.random((3, 12, 14, 3)), jnp.float32)
     both = jnp.stack([reference, reference / 2], axis=1)
     halves = jnp.stack([reference, 3 * reference], axis=1)
-    weight = jnp.array([1.0, 2.0, 4.0], jnp.float32)
+    weight = jnp.array([[1.0, 8.0], [2.0, 16.0], [4.0, 32.0]], jnp.float32)
     return training.Examples({"full": both, "one": both[..., :1]}, halves, weight)
 
 
@@ -46,8 +46,9 @@ def test_draw_keeps_images_together(examples):
         assert 0.5 <= float(crop.unit) <= 2
         variants.add(share)
         # Its pixels are those of the frame whose weight it has, up to their channels.
-        weights.add(float(crop.weight))
-        frame = examples.halves[int(np.log2(crop.weight)), 0]
+        weight = float(crop.weight) / (1 if share == 1 else 8)
+        weights.add(weight)
+        frame = examples.halves[int(np.log2(weight)), 0]
         pixels = np.sort(np.asarray(frame).reshape(-1, 3), axis=-1)
         found = np.sort(np.asarray(reference).reshape(-1, 3), axis=-1)
         assert {tuple(p) for p in found} <= {tuple(p) for p in pixels}

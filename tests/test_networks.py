@@ -230,6 +230,26 @@ def test_equal_weights_are_the_estimator_without_a_network(images):
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
+@pytest.mark.parametrize("form", ["quotient", "direct"])
+def test_training_begins_with_a_gradient_at_every_pixel(form, images):
+    """Without its limits alpha has one, in both forms."""
+    x, y, _, _, v = images
+    unit = median_luminance(x)
+    x, y, v = x / unit, y / unit, v / unit**2
+    network = networks.MixingNetwork(key(), size="light", form=form)
+    outputs = network(x, y, v, v)
+    activate = progressive.FORMS[form]
+
+    @jax.jit
+    def share(limit_outputs):
+        slopes = jax.grad(lambda o: activate(o, limit=False).sum())(limit_outputs)
+        return jnp.mean(jnp.any(slopes != 0, axis=2))
+
+    assert share(outputs) == 1.0
+    if form == "quotient":  # begins with denominators about one
+        assert jnp.mean(outputs[:, :, 2] > 1e-3) > 0.5
+
+
 def test_the_dual_form_blends_the_crossed_halves_by_the_networks_share(images):
     x, _, a, b, v = images
     x_b = 1.1 * x[::-1]

@@ -54,8 +54,7 @@ def test_the_best_step_is_kept(frames, tmp_path):
     r, noise = (i[:32, :32] for i in frame.reference)
     error = metrics.rel_l2(recipe.combine(network, cut), r, half_difference=noise)
     r, noise = frame.reference  # the better input is judged on the whole frame
-    images = frame.color, frame.estimates["oidn"].image
-    better = min(metrics.rel_l2(i, r, half_difference=noise) for i in images)
+    better = metrics.rel_l2(frame.color, r, half_difference=noise)
     np.testing.assert_allclose(min(errors), float(error / better), rtol=1e-4)
 
 
@@ -108,7 +107,7 @@ def test_validation_is_the_error_over_the_better_input(frames, tmp_path):
     found = cli.prepare(recipe, held, tmp_path, piece=32, variants=False)
     assert len(found.samples) == len(found.better) == len(found.examples.halves)
     assert {*found.samples.tolist()} == {64}
-    np.testing.assert_allclose(found.examples.weight, 1 / found.better)
+    np.testing.assert_allclose(found.examples.weight[:, 0], 1 / found.better)
     frame = exr.read_frame(held[0]).normalised()
     r, noise = frame.reference
     images = frame.color, frame.estimates["oidn"].image

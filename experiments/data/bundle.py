@@ -1,14 +1,17 @@
-"""Make the frames that come with the package, and the crops that the tests use.
+"""Make the frames that come with the package, and the small ones that the tests use.
 
 Renders the glass scene with 64 and with 1024 samples a pixel and a reference of 32768,
 and the plain scene with 64 and 4096, into the work folder (resumable, about 12 minutes
 on two cores with LLVM). Writes `jscomb/data/` with two sub-buffers, in 16 bits where no
-error is measured, and 64x64 crops with all four to `tests/data/`.
+error is measured, and 64x64 crops with all four to `tests/data/`, beside small frames
+of random scenes of the test split of `experiments.data.dataset`, photon mapped too.
 """
 
 import dataclasses
 import functools
 import pathlib
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 
@@ -16,7 +19,7 @@ from experiments.common.command import tool
 from jscomb import exr
 from jscomb.cli import render_file
 from jscomb.frame import Frame
-from jscomb.rendering import Settings
+from jscomb.rendering import PHOTONS, Settings
 
 ROOT = pathlib.Path(__file__).parents[2]
 HALF = ("albedo", "normal", "depth", "visibility", "estimate_halves", "half_difference")
@@ -28,6 +31,8 @@ CROPS = {
     "cornell-box-64": BOX,
 }
 CROP = 64
+UNSEEN = ("random-3001", "random-3004", "random-3007")  # no network is trained on them
+UNSEEN_SPP = (256, 16)  # the first brings the reference and the photon-mapped image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +79,40 @@ def run(config: Config) -> list[pathlib.Path]:
         if out.stem in CROPS:
             targets[ROOT / "tests" / "data" / out.name] = crop(frame, *CROPS[out.stem])
         for path, kept in targets.items():
-            path.parent.mkdir(exist_ok=True)
-            exr.write_frame(path, kept, provenance=provenance, half=HALF)
-            print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1e6:.2f} MB")
-            written.append(path)
-    return written
+            written.append(_write(path, kept, provenance))
+    return written + [path for scene in UNSEEN for path in _unseen(config, scene)]
+
+
+def _unseen(config: Config, scene: str) -> Iterator[pathlib.Path]:
+    """Render a scene's small frames, which share a reference and the photons."""
+    first = None
+    for number, spp in enumerate(UNSEEN_SPP):
+        out = config.work / f"{scene}-{spp}.exr"
+        more = {"reference_spp": 16_384, "photons": 100_000, "passes": 16}
+        settings = Settings(
+            spp=spp,
+            size=CROP,
+            buffers=config.buffers,
+            seed=number * 10**6,
+            **({} if first else more),
+        )
+        if not out.exists():
+            render_file(scene, out, settings, reference_from=first)
+        frame = exr.read_frame(out)
+        if first:
+            photons = exr.read_frame(first).estimates[PHOTONS]
+            frame = frame.with_estimate(PHOTONS, photons)
+        first = first or out
+        path = ROOT / "tests" / "data" / f"unseen-{out.name}"
+        yield _write(path, frame, exr.read_provenance(out))
+
+
+def _write(path: pathlib.Path, frame: Frame, provenance: Any) -> pathlib.Path:
+    """Write a file, features and halves of estimates in 16 bits, and say its size."""
+    path.parent.mkdir(exist_ok=True)
+    exr.write_frame(path, frame, provenance=provenance, half=HALF)
+    print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1e6:.2f} MB")
+    return path
 
 
 def crop(frame: Frame, top: int, left: int) -> Frame:

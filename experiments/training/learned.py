@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import tyro
 from matplotlib.figure import Figure
 
@@ -25,7 +24,7 @@ from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.data import dataset
 from experiments.training.train import ALL
-from jscomb import double_shrinkage, exr, james_stein, progressive
+from jscomb import exr
 from jscomb.learning import recipes
 from jscomb.learning.examples import draw_losses
 from jscomb.typing import Image
@@ -49,35 +48,6 @@ class Config(Options):
     runs: pathlib.Path | None = None
     split: str = "test"
     results: pathlib.Path | None = None
-
-
-def _james_stein(inputs: Mapping[str, Image]) -> Image:
-    """Whitened, with robust variances, on the same (regressed) image."""
-    y = (inputs["biased_a"] + inputs["biased_b"]) / 2
-    v = james_stein.robust_variance(inputs["variance"])
-    return james_stein.combine(inputs["unbiased"], y, v, window=7, whiten=True)
-
-
-def _double_shrinkage(inputs: Mapping[str, Image]) -> Image:
-    """With the errors as they are, and the confidence that they give."""
-    p, u, b = (inputs[name] for name in ("prior", "unbiased", "biased"))
-    v, m = (jnp.broadcast_to(inputs[name], u.shape) for name in ("variance", "mse"))
-    eta = double_shrinkage.confidence(p, u, b, v, m)
-    return double_shrinkage.combine(p, u, b, v, m, eta)
-
-
-def _progressive(inputs: Mapping[str, Image]) -> Image:
-    """By SURE over windows, whitened."""
-    mix = functools.partial(progressive.mixing, whiten=True)
-    return progressive.combine(**inputs, mix=mix)
-
-
-WITHOUT_NETWORK: dict[str, Callable[[Mapping[str, Image]], Image]] = {
-    "njs": _james_stein,
-    "dsc": _double_shrinkage,
-    "pd": _progressive,
-}
-"""By the first word of a method's name."""
 
 
 class Trained(NamedTuple):
@@ -139,24 +109,17 @@ def measure(path: pathlib.Path, trained: Mapping[str, Trained]) -> dict[str, flo
         recipe = ALL[method]
         estimate = frame.estimates[recipe.estimate]
         inputs = recipe.inputs(jax.random.key(0), frame, estimate)
-        combine = _compiled(method)
+        combine = _compiled(recipe.combine)
         images[f"{name}, {TRAINED}"] = combine(network, inputs)
         images[f"{name}, {UNTRAINED}"] = combine(untrained, inputs)
-        plain = WITHOUT_NETWORK.get(method.partition("-")[0])
-        if plain:
-            images[f"{name}, {WITHOUT}"] = _plain(plain)(inputs)
+        if recipe.without:
+            images[f"{name}, {WITHOUT}"] = _compiled(recipe.without)(inputs)
     return {name: errors.relative_l2(image, frame) for name, image in images.items()}
 
 
 @functools.cache
-def _compiled(method: str) -> Callable[..., Image]:
-    """A method's combiner as one program."""
-    return jax.jit(ALL[method].combine)
-
-
-@functools.cache
-def _plain(function: Callable[..., Image]) -> Callable[..., Image]:
-    """An estimator without a network as one program."""
+def _compiled(function: Callable[..., Image]) -> Callable[..., Image]:
+    """As one program for all frames of one size."""
     return jax.jit(function)
 
 

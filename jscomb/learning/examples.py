@@ -31,6 +31,12 @@ __all__ = [
     "validate",
 ]
 
+_COMBINED = (
+    "unbiased",
+    "biased",
+    "biased_a",
+    "noisy",
+)  # images among a recipe's inputs
 _LEAST = 0.02  # of the better input's error: less is not known from noisy references
 
 Arrays = Mapping[str, np.ndarray]
@@ -63,8 +69,9 @@ def make_inputs(
 
     Returns:
         inputs by name, [V,H,W,C]; the `halves` of the reference, [2,H,W,3]; the
-        relative L2 of the `better` of the frame's image and its estimate, []; and the
-        frame's `samples`, []. Empty if the camera sees no light.
+        relative L2 of the `better` of the images that each variant combines, [V], at
+        least the reference's own noise; and the frame's `samples`, []. Empty if the
+        camera sees no light.
 
     Raises:
         ValueError: if the frame lacks what is needed.
@@ -74,7 +81,7 @@ def make_inputs(
         >>> frame = exr.read_frame(exr.bundled()["cornell-glass-64"])
         >>> found = make_inputs(recipes.RECIPES["kernels"], frame)
         >>> print(found["depth"].shape, found["halves"].shape)
-        (1, 128, 128, 1) (2, 128, 128, 3)
+        (1, 192, 192, 1) (2, 192, 192, 3)
     """
     if frame.reference is None or frame.reference.half_difference is None:
         raise ValueError("training needs a reference with halves")
@@ -87,13 +94,16 @@ def make_inputs(
     assert difference is not None
     halves = jnp.stack([r + difference / 2, r - difference / 2])
     noise = metrics.rel_l2(r, r) - metrics.rel_l2(r, r, half_difference=difference)
-    errors = [_error(image, halves) for image in (frame.color, estimate.image)]
     makers = (recipe.inputs, *(recipe.others if variants else ()))
     made = [make(jax.random.key(0), frame, estimate) for make in makers]
+    better = [
+        min(_error(each[name], halves) for name in _COMBINED if name in each)
+        for each in made
+    ]
     inputs = {name: np.stack([m[name] for m in made]) for name in made[0]}
     return inputs | {
         "halves": np.asarray(halves),
-        "better": np.asarray(jnp.maximum(min(errors), noise)),
+        "better": np.asarray(jnp.maximum(jnp.stack(better), noise)),
         "samples": np.asarray(frame.samples or 0),
     }
 
@@ -131,20 +141,22 @@ def stack_examples(found: Sequence[Arrays]) -> Judged:
         found: of `pieces`, at least one.
 
     Returns:
-        the examples; the weight of a piece is 1 / its better input's error.
+        the examples; the weight of a piece is 1 / its better input's error, so that
+        the loss is a ratio like what a network is judged by.
 
     Example:
         >>> piece = {"x": np.ones((1, 4, 4, 3)), "halves": np.ones((2, 4, 4, 3))}
-        >>> piece |= {"better": np.array(0.5), "samples": np.array(16)}
+        >>> piece |= {"better": np.array([0.5]), "samples": np.array(16)}
         >>> print(stack_examples([piece, piece]).examples.weight)
-        [2. 2.]
+        [[2.]
+         [2.]]
     """
     stacked = lambda name: jnp.asarray(np.stack([each[name] for each in found]))
     own = {"halves", "better", "samples"}
     inputs = {name: stacked(name) for name in found[0] if name not in own}
     better = stacked("better")
     examples = training.Examples(inputs, stacked("halves"), 1 / better)
-    return Judged(examples, better, np.array([each["samples"] for each in found]))
+    return Judged(examples, better[:, 0], np.array([each["samples"] for each in found]))
 
 
 def objective(
@@ -191,7 +203,7 @@ def validate(recipe: Recipe, network: Network, held: Judged) -> Float[Array, " n
 
     Example:
         >>> piece = {"x": np.ones((1, 4, 4, 3)), "halves": 2 * np.ones((2, 4, 4, 3))}
-        >>> piece |= {"better": np.array(0.5), "samples": np.array(16)}
+        >>> piece |= {"better": np.array([0.5]), "samples": np.array(16)}
         >>> scale = lambda gain, inputs: gain * inputs["x"]
         >>> recipe = recipes.RECIPES["njs"]._replace(combine=scale)
         >>> print(validate(recipe, jnp.array(1.0), stack_examples([piece])).round(2))
@@ -217,7 +229,7 @@ def summary(ratios: Float[Array, " n"], samples: np.ndarray) -> dict[str, float]
     """
     values = np.asarray(ratios, np.float64)
     mean = lambda some: float(np.exp(np.mean(np.log(some))))
-    found = {str(n): mean(values[samples == n]) for n in np.unique(samples)}
+    found = {f"{n:g}": mean(values[samples == n]) for n in np.unique(samples)}
     return found | {"all": mean(values), "worst": float(values.max())}
 
 

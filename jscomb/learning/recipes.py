@@ -23,6 +23,7 @@ from jscomb.features import stack
 from jscomb.frame import Estimate, Frame
 from jscomb.learning import checkpoints, losses, networks
 from jscomb.numerics import luminance
+from jscomb.numerics.tiles import compiled
 from jscomb.typing import Image, Key, Scalar
 
 __all__ = [
@@ -47,7 +48,8 @@ WEIGHTS = pathlib.Path(str(importlib.resources.files("jscomb.learning"))) / "wei
 """Folder of the parameters that come with the package, and of their cards."""
 
 # By which power of a unit of radiance inputs are divided; the others by the first.
-_POWERS = {"variance": 2, "sure": 2, "mse": 2, "albedo": 0, "normal": 0, "depth": 0}
+_POWERS = {"variance": 2, "sure": 2, "mse": 2, "noise": 2}
+_POWERS |= {"albedo": 0, "normal": 0, "depth": 0}
 
 
 class Recipe(NamedTuple):
@@ -60,6 +62,7 @@ class Recipe(NamedTuple):
         loss: of an image and the halves of a reference, all normalised.
         options: of the network: what it is for, in words that a card can hold.
         estimate: name of the frame's estimate that it combines.
+        without: the estimator without a network, from the same inputs.
         others: inputs in place of `inputs` that training draws as often.
         training: options of `combine` while training.
     """
@@ -70,6 +73,7 @@ class Recipe(NamedTuple):
     loss: Callable[[Image, Halves], Scalar] = losses.relative_l2
     options: Mapping[str, Any] = types.MappingProxyType({})
     estimate: str = "oidn"
+    without: Callable[[Inputs], Image] | None = None
     others: tuple[MakeInputs, ...] = ()
     training: Mapping[str, Any] = types.MappingProxyType({})
 
@@ -162,14 +166,12 @@ def _progressive(
 ) -> Inputs:
     """Return PD's inputs; denoises anew, since SURE probes the denoiser."""
     del estimate
-    found = progressive.neural_inputs(key, denoise, frame)
-    found.pop("noise", None)  # of the bound, which the network does not see
-    return found
+    return progressive.neural_inputs(key, denoise, frame)
 
 
 def _bilateral(color: Image, frame: Frame) -> Image:
     """Denoise a colour by a filter that knows the features."""
-    return bilateral.denoise(color, frame.variance, stack(frame))
+    return compiled(bilateral.denoise)(color, frame.variance, stack(frame))
 
 
 def _kernel_predicting(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
@@ -186,6 +188,30 @@ def _joint(network: networks.Joint, inputs: Mapping[str, Image]) -> Image:
     return james_stein.combine_inputs(network.combiner, images)
 
 
+def _james_stein_without(inputs: Mapping[str, Image]) -> Image:
+    """Whitened, with robust variances."""
+    y = (inputs["biased_a"] + inputs["biased_b"]) / 2
+    v = james_stein.robust_variance(inputs["variance"])
+    return james_stein.combine(inputs["unbiased"], y, v, window=7, whiten=True)
+
+
+def _double_shrinkage_without(inputs: Mapping[str, Image]) -> Image:
+    """With the errors as they are, and the confidence that they give."""
+    p, u, b = (inputs[name] for name in ("prior", "unbiased", "biased"))
+    v, m = (jnp.broadcast_to(inputs[name], u.shape) for name in ("variance", "mse"))
+    eta = double_shrinkage.confidence(p, u, b, v, m)
+    return double_shrinkage.combine(p, u, b, v, m, eta)
+
+
+def _progressive_without(inputs: Mapping[str, Image]) -> Image:
+    """By SURE over windows, whitened."""
+    mix, images = (
+        functools.partial(progressive.mixing, whiten=True),
+        dict[str, Any](inputs),
+    )
+    return progressive.combine(**images, mix=mix)
+
+
 _DENOISERS = (
     oidn.denoise_color,
     functools.partial(oidn.denoise_color, variant=oidn.VARIANTS["oidn-color"]),
@@ -200,6 +226,7 @@ RECIPES = {
         james_stein.neural_inputs,
         james_stein.combine_inputs,
         options={"rule": james_stein.Rule(window=7, whiten=True)},
+        without=_james_stein_without,
         others=(functools.partial(james_stein.neural_inputs, choose="opposite"),),
     ),
     "dsc": Recipe(
@@ -207,6 +234,7 @@ RECIPES = {
         _double_shrinkage,
         double_shrinkage.combine_inputs,
         options={"serves": "denoised"},
+        without=_double_shrinkage_without,
     ),
     "dsc-photons": Recipe(
         networks.ShrinkageNetwork,
@@ -214,13 +242,15 @@ RECIPES = {
         double_shrinkage.combine_inputs,
         options={"serves": "independent"},
         estimate="photons",
+        without=_double_shrinkage_without,
     ),
     "pd": Recipe(
         networks.MixingNetwork,
         _PD[0],
         progressive.combine_inputs,
         options={"form": "direct"},
-        others=(*_PD[1:], *map(exchanged, _PD)),
+        without=_progressive_without,
+        others=(*_PD[1:], *map(exchanged, _PD[:2])),
         training={"bound": False, "limit": False},
     ),
     "kernels": Recipe(

@@ -57,12 +57,12 @@ class Examples(NamedTuple):
     Attributes:
         inputs: of a recipe, normalised, [N,V,H,W,C] each; V variants of each frame.
         halves: of the references, normalised radiance, [N,2,H,W,3].
-        weight: of each frame's loss, [N].
+        weight: of the loss of each variant, [N,V].
     """
 
     inputs: dict[str, Float[Array, "n v h w _"]]
     halves: Float[Array, "n 2 h w c"]
-    weight: Float[Array, " n"]
+    weight: Float[Array, "n v"]
 
 
 class Crop(NamedTuple):
@@ -135,7 +135,7 @@ def run(
     Example:
         >>> x = jnp.ones((1, 1, 4, 4, 3))
         >>> r = 2 * jnp.ones((1, 2, 4, 4, 3))
-        >>> examples = Examples({"x": x}, r, jnp.ones(1))
+        >>> examples = Examples({"x": x}, r, jnp.ones((1, 1)))
         >>> def loss(gain, inputs, halves, unit):
         ...     return jnp.mean((gain * inputs["x"] - halves[0]) ** 2)
         >>> schedule = Schedule(steps=200, batch=1, crop=2, rate=0.1)
@@ -185,7 +185,8 @@ def evaluate(
 
     Example:
         >>> x = jnp.ones((2, 1, 4, 4, 3))
-        >>> examples = Examples({"x": x}, 2 * jnp.ones((2, 2, 4, 4, 3)), jnp.ones(2))
+        >>> r = 2 * jnp.ones((2, 2, 4, 4, 3))
+        >>> examples = Examples({"x": x}, r, jnp.ones((2, 1)))
         >>> def loss(gain, inputs, halves, unit):
         ...     return jnp.mean((gain * inputs["x"] - halves[0]) ** 2)
         >>> print(evaluate(loss, jnp.array(1.5), examples))
@@ -209,8 +210,8 @@ def draw(key: Key, examples: Examples, schedule: Schedule) -> Crop:
         the crop.
 
     Example:
-        >>> x = jnp.ones((2, 2, 8, 8, 3))
-        >>> examples, schedule = Examples({"x": x}, x, jnp.ones(2)), Schedule(crop=4)
+        >>> x, schedule = jnp.ones((2, 2, 8, 8, 3)), Schedule(crop=4)
+        >>> examples = Examples({"x": x}, x, jnp.ones((2, 2)))
         >>> cut = jax.jit(draw, static_argnames="schedule")
         >>> crop = cut(jax.random.key(0), examples, schedule=schedule)
         >>> print(crop.inputs["x"].shape, crop.halves.shape)
@@ -240,7 +241,7 @@ def draw(key: Key, examples: Examples, schedule: Schedule) -> Crop:
     inputs = {name: cut(array)[way] for name, array in examples.inputs.items()}
     off = jax.random.uniform(unit, (), examples.halves.dtype, -1.0, 1.0)
     unit_drawn = 2 ** (schedule.jitter * off)
-    return Crop(inputs, cut(examples.halves), unit_drawn, examples.weight[frame])
+    return Crop(inputs, cut(examples.halves), unit_drawn, examples.weight[frame, way])
 
 
 def _batch_loss(

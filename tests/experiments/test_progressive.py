@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.progressive import progressive, sure
+from experiments.progressive import consistency, progressive, sure
 from jscomb.denoisers import oidn
 
 
@@ -42,3 +42,18 @@ def test_sure_is_compared_with_the_truth(folder):
     ratio = row["james-stein, whitened 7x7, corrected"] / row["oidn"]
     assert f"{ratio:.2f} of the denoiser's error" in said.answer
     assert f"| glass 64 | {row['path tracing']:#.3g} |" in said.body
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+def test_the_mix_is_measured_from_few_samples_to_many(tmp_path):
+    config = consistency.Config("cornell-box", tmp_path, quick=True)
+    found = consistency.run(config)
+    assert list(found) == [4, 16, 64]
+    assert all(np.isfinite(list(row.values())).all() for row in found.values())
+    assert found[64]["path tracing"] < found[4]["path tracing"]
+    # Bounded, the mix moves less, towards path tracing.
+    assert found[64]["mix"] != found[64]["mix, no bound"]
+    said = consistency.report(found)
+    last = found[64]["mix"] / found[64]["path tracing"]
+    assert f"to {last:.3f}, at most" in said.answer.rpartition("; mix ")[2]
