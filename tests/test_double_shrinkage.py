@@ -557,3 +557,15 @@ def test_the_wrong_use_of_a_network_warns(glass_frame):
         double_shrinkage.plan_neural(network, frame, y)
     finally:
         del network.__class__.serves
+
+
+def test_a_wild_prior_is_limited_to_what_the_images_allow():
+    """A lone 69 beside u = 0.5 +- 0.25 goes; a prior that replaces a firefly stays."""
+    at = lambda value: jnp.full((2, 2, 3), value)
+    limited = lambda *images: double_shrinkage.limit_prior(*map(at, images))
+    np.testing.assert_allclose(limited(69.0, 0.5, 0.0, 0.0625), 1.25)
+    np.testing.assert_allclose(limited(-69.0, 0.5, 0.0, 0.0625), -0.25)
+    firefly = limited(1.1, 1e6, 1.0, 0.0)  # its own variance silent
+    np.testing.assert_allclose(firefly, 1.1)
+    missed = limited(4.0, 0.1, 5.0, 0.0)  # u missed a light
+    np.testing.assert_allclose(missed, 4.0)

@@ -30,6 +30,7 @@ from jscomb.double_shrinkage._estimate import (
     biased_error,
     confidence,
     dependence,
+    limit_prior,
     radius_bias,
     unbiased_error,
 )
@@ -61,6 +62,7 @@ __all__ = [
     "dependence",
     "depends",
     "factors",
+    "limit_prior",
     "make_inputs",
     "neural_combine",
     "neural_combine_frame",

@@ -26,6 +26,7 @@ from jscomb.numerics.guards import (
 from jscomb.numerics.windows import block_sum, window_sum
 from jscomb.typing import Image, Scalar
 
+_DEVIATIONS = 3.0  # of the unbiased image, that a prior may be away from it
 _BLOCK = 8  # width in pixels of the blocks whose noise is compared
 
 
@@ -213,6 +214,38 @@ def confidence(
     size = (jnp.square(blend) + level) / 2
     eta = jnp.maximum(_pooled(excess, level, size, window), 0.0)
     return jnp.where(level > 0, eta, size)
+
+
+def limit_prior(prior: Image, unbiased: Image, biased: Image, variance: Image) -> Image:
+    """Limit a prior to what the noise of the unbiased or the biased image allows.
+
+    A regression may be wild beside a light, where pooled errors do not tell. Here a
+    value beyond three standard deviations of u becomes the farthest that is not, or b
+    where that is farther: u may be a firefly, or have missed a light.
+
+    Args:
+        prior: p, linear radiance, shape [H,W,C].
+        unbiased: u, linear radiance, shape [H,W,C].
+        biased: b, linear radiance, shape [H,W,C].
+        variance: v of u, squared radiance, at least zero, shape [H,W,C].
+
+    Returns:
+        the prior, shape [H,W,C]; not finite where an image is not.
+
+    Raises:
+        ValueError: if shapes differ.
+
+    Example:
+        >>> at = lambda value: jnp.full((1, 1, 1), value)
+        >>> print(limit_prior(at(69.0), at(0.5), at(0.25), at(0.0625)).item())
+        1.25
+
+    Source: ours.
+    """
+    check_same_shape(prior=prior, unbiased=unbiased, biased=biased, variance=variance)
+    deviation = _DEVIATIONS * safe_sqrt(variance)
+    lowest = jnp.minimum(unbiased - deviation, biased)
+    return jnp.clip(prior, lowest, jnp.maximum(unbiased + deviation, biased))
 
 
 class Dependence(NamedTuple):

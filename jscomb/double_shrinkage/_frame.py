@@ -11,6 +11,7 @@ from jscomb.double_shrinkage._estimate import (
     biased_error,
     confidence,
     dependence,
+    limit_prior,
     unbiased_error,
 )
 from jscomb.double_shrinkage._neural import Network, combine_inputs
@@ -172,6 +173,7 @@ def _estimated(
         stride=stride,
         ridge=ridge,
     )
+    p = limit_prior(p, u, b, v)
     return p, v, m, confidence(p, u, b, v, m)
 
 

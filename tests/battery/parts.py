@@ -175,6 +175,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         "double_shrinkage.confidence": lambda r: double_shrinkage.confidence(
             r.biased, *_of_radiance(r), shared(r)
         ),
+        "double_shrinkage.limit_prior": lambda r: double_shrinkage.limit_prior(
+            2 * r.biased, *_of_radiance(r)
+        ),
         "double_shrinkage.factors": lambda r: double_shrinkage.factors(
             r.variance, shared(r), shared(r)
         ),
