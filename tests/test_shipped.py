@@ -19,7 +19,12 @@ from jscomb.learning.recipes import RECIPES
 from jscomb.metrics import rel_l2
 
 FRAMES = sorted(pathlib.Path(__file__).parent.glob("data/*.exr"))
-EARNED = ["pd"]  # what the default method runs; the others' cards say what they miss
+# Which promises each network keeps; its card says what it misses on the test split.
+UNTRAINED, WITHOUT, WORST = "10 % below untrained", "5 % below without", "worst 1.05"
+KEPT = {
+    "pd": {UNTRAINED, WITHOUT, WORST},
+    "dsc-photons": {UNTRAINED, WITHOUT, WORST},
+}
 SEEDS = (0, 1, 2)
 
 pytestmark = pytest.mark.skipif(not oidn.available(), reason="needs a denoiser")
@@ -35,9 +40,15 @@ def given(name):
             continue
         estimate = frame.estimates[recipe.estimate]
         inputs = recipe.inputs(jax.random.key(0), frame, estimate)
-        better = min(error(i, frame) for i in (frame.color, estimate.image))
+        y = inputs.get("biased", inputs.get("biased_a"))  # pd denoises by itself
+        better = min(error(i, frame) for i in (frame.color, y))
         found.append((frame, inputs, better))
     return found
+
+
+def samples(name):
+    """A pixel, of every frame."""
+    return np.array([frame.samples for frame, *_ in given(name)])
 
 
 def error(image, frame):
@@ -72,13 +83,14 @@ def mean(values):
     return np.exp(np.mean(np.log(values)))
 
 
-def earns(values, untrained, plain):
+def kept(values, untrained, plain):
     """Which of the promises hold for these ratios."""
-    return {
-        "10 % below untrained": all(mean(values) <= 0.9 * mean(u) for u in untrained),
-        "5 % below without a network": mean(values) <= 0.95 * mean(plain),
-        "worst at most 1.05": values.max() <= 1.05,
+    held = {
+        UNTRAINED: all(mean(values) <= 0.9 * mean(u) for u in untrained),
+        WITHOUT: mean(values) <= 0.95 * mean(plain),
+        WORST: values.max() <= 1.05,
     }
+    return {promise for promise, holds in held.items() if holds}
 
 
 def test_the_frames_are_of_several_scenes_and_counts():
@@ -91,21 +103,19 @@ def test_the_frames_are_of_several_scenes_and_counts():
     assert not {scene.removeprefix("unseen-") for scene in scenes} & trained
 
 
-@pytest.mark.parametrize("name", EARNED)
-def test_a_shipped_network_keeps_every_promise(name):
+@pytest.mark.parametrize("name", KEPT)
+def test_a_shipped_network_keeps_its_promises(name):
     untrained = [of_network(name, seed) for seed in SEEDS]
-    held = earns(of_network(name), untrained, without(name))
-    assert all(held.values()), held
-    for samples in (16, 64, 256, 1024):
-        at = [file.stem.endswith(f"-{samples}") for file in FRAMES]
-        for each in untrained:
-            assert mean(of_network(name)[at]) < mean(each[at])
+    found, plain = of_network(name), without(name)
+    assert kept(found, untrained, plain) >= KEPT[name], (found, plain)
+    for count in np.unique(samples(name)):
+        at = samples(name) == count
+        assert all(mean(found[at]) < mean(each[at]) for each in untrained)
 
 
-@pytest.mark.parametrize("name", EARNED)
+@pytest.mark.parametrize("name", KEPT)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_random_parameters_keep_none(name, seed):
+def test_random_parameters_do_not(name, seed):
     """In place of the trained ones, beside others drawn at random."""
     others = [of_network(name, other) for other in SEEDS if other != seed]
-    held = earns(of_network(name, seed), others, without(name))
-    assert not any(held.values()), held
+    assert not kept(of_network(name, seed), others, without(name)) >= KEPT[name]

@@ -75,6 +75,11 @@ def _network(name: str) -> Any:
     return shipped(name)
 
 
+def _shrinkage_network(frame: Frame, estimate: Estimate) -> str:
+    """Which network a biased image needs, by whether its noise is the frame's."""
+    return "dsc" if double_shrinkage.depends(frame, estimate) else "dsc-photons"
+
+
 def _james_stein(summary: str, **options: Any) -> Method:
     """James-Stein without its network."""
     plan = lambda key, frame, y: james_stein.plan_frame(frame, y, **options)
@@ -164,7 +169,9 @@ METHODS: dict[str, Method] = {
         "double shrinkage with a trained network",
         double_shrinkage.NEEDS._replace(channels=3),
         "one estimate",
-        lambda key, frame, y: double_shrinkage.plan_neural(_network("dsc"), frame, y),
+        lambda key, frame, y: double_shrinkage.plan_neural(
+            _network(_shrinkage_network(frame, y)), frame, y
+        ),
     ),
     "ensemble": Method(
         "weights of minimum error for all the frame's estimates and several denoisers",
