@@ -23,6 +23,7 @@ FRAMES = sorted(pathlib.Path(__file__).parent.glob("data/*.exr"))
 UNTRAINED, WITHOUT, WORST = "10 % below untrained", "5 % below without", "worst 1.05"
 KEPT = {
     "pd": {UNTRAINED, WITHOUT, WORST},
+    "dsc": {UNTRAINED},
     "dsc-photons": {UNTRAINED, WITHOUT, WORST},
 }
 SEEDS = (0, 1, 2)
