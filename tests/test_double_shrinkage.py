@@ -385,6 +385,7 @@ def test_a_frame_is_made_of_the_parts(glass_frame):
     first = double_shrinkage.factors(v, m, 0 * v)
     x1, s = first.blend(u, y.image), one(first.error)
     p = prior(x1, x1, s, s, features, window=9)
+    p = double_shrinkage.limit_prior(p, u, y.image, v)
     eta = double_shrinkage.confidence(p, u, y.image, v, m)
     expected = combine(p, u, y.image, v, m, eta)
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-3)

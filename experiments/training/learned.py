@@ -107,6 +107,8 @@ def measure(path: pathlib.Path, trained: Mapping[str, Trained]) -> dict[str, flo
     images |= {name: each.image for name, each in frame.estimates.items()}
     for name, (method, network, untrained) in trained.items():
         recipe = ALL[method]
+        if recipe.estimate not in frame.estimates:
+            continue
         estimate = frame.estimates[recipe.estimate]
         inputs = recipe.inputs(jax.random.key(0), frame, estimate)
         combine = _compiled(recipe.combine)
@@ -176,9 +178,10 @@ def ratios(found: Found, name: str, kind: str) -> dict[str, list[float]]:
     """
     estimate, of = found.combines[name], f"{name}, {kind}"
     better = lambda row: min(row["path tracing"], row[estimate])
+    rows = {key: row for key, row in found.rows.items() if of in row}
     return {
         str(samples): [max(row[of] / better(row), 0.02) for row in group]
-        for samples, group in errors.by_samples(found.rows).items()
+        for samples, group in errors.by_samples(rows).items()
     }
 
 
@@ -209,8 +212,8 @@ def kinds(found: Found, name: str) -> list[str]:
     Returns:
         trained, untrained and, where there is one, without a network.
     """
-    row = next(iter(found.rows.values()))
-    return [k for k in (TRAINED, UNTRAINED, WITHOUT) if f"{name}, {k}" in row]
+    named = {key for row in found.rows.values() for key in row}
+    return [k for k in (TRAINED, UNTRAINED, WITHOUT) if f"{name}, {k}" in named]
 
 
 def verdict(found: Found, name: str) -> dict[str, bool]:
@@ -264,7 +267,8 @@ def report(found: Found) -> Report:
         means beside the worst frame, promises, every frame, and the losses.
     """
     cells, answers = [], []
-    for name in found.combines:
+    measured = [name for name in found.combines if kinds(found, name)]
+    for name in measured:
         means = {kind: summary(found, name, kind) for kind in kinds(found, name)}
         cells += [[name, kind, *each.values()] for kind, each in means.items()]
         held = verdict(found, name)
@@ -274,14 +278,16 @@ def report(found: Found) -> Report:
         said = f"misses: {', '.join(missed)}" if missed else "keeps every promise"
         first = f"{name} {of['all']:.3f} (worst {of['worst']:.2f})"
         answers.append(f"{', '.join([first, *others])}; {said}")
-    counts = list(summary(found, next(iter(found.combines)), TRAINED))
+    counts = list(summary(found, measured[0], TRAINED))
     answer = (
         "Relative L2 over the better of path tracing and the estimate, geometric mean "
         f"of {len(found.rows)} frames: {'. '.join(answers)}."
     )
     first = table(["network", "kind", *counts], cells)
-    names = list(next(iter(found.rows.values())))
-    every = [[frame, *(row[n] for n in names)] for frame, row in found.rows.items()]
+    names = list(dict.fromkeys(name for row in found.rows.values() for name in row))
+    every = [
+        [frame, *(row.get(n, "") for n in names)] for frame, row in found.rows.items()
+    ]
     body = f"{first}\n\n{table(['frame', *names], every)}"
     return Report(answer, body, {"Losses against steps": curves(found.cards)})
 
