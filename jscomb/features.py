@@ -8,6 +8,7 @@ number of copies. The selection depends on values, so `select` runs in NumPy, ou
 """
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,7 +18,10 @@ from jaxtyping import Array, ArrayLike, Float
 from jscomb.frame import Frame
 from jscomb.typing import Image
 
-__all__ = ["Selection", "select", "stack"]
+__all__ = ["FEATURES", "Selection", "scaled_depth", "select", "stack"]
+
+FEATURES = MappingProxyType({"albedo": 3, "normal": 3, "depth": 1})
+"""Channels of the features that networks see."""
 
 _ROUNDING = 1e-6  # relative to the largest value, for constants in float32
 
@@ -68,12 +72,28 @@ def stack(frame: Frame) -> Image:
         frame.visibility,
     )
     if depth is not None:
-        farthest = jnp.max(depth, where=jnp.isfinite(depth), initial=0.0)
-        depth = depth / jnp.where(farthest > 0, farthest, 1.0)
+        depth = scaled_depth(depth)
     given = [f for f in (albedo, normal, depth, visibility) if f is not None]
     height, width, _ = frame.color.shape
     none = jnp.zeros((height, width, 0), frame.color.dtype)
     return jnp.concatenate([none, *given], axis=-1)
+
+
+def scaled_depth(depth: Float[Array, "h w 1"]) -> Float[Array, "h w 1"]:
+    """Return depth in units of its largest finite value.
+
+    Args:
+        depth: any unit, shape [H,W,1].
+
+    Returns:
+        at most 1, same shape.
+
+    Example:
+        >>> print(scaled_depth(jnp.array([[[2.0], [4.0]]])).ravel())
+        [0.5 1. ]
+    """
+    farthest = jnp.max(depth, where=jnp.isfinite(depth), initial=0.0)
+    return depth / jnp.where(farthest > 0, farthest, 1.0)
 
 
 def select(stacks: Sequence[Float[ArrayLike, "h w f"]]) -> Selection:

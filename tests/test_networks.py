@@ -9,8 +9,9 @@ import pytest
 from jax import lax
 from jax.test_util import check_grads
 
-from jscomb import double_shrinkage, james_stein, progressive
+from jscomb import double_shrinkage, ensemble, james_stein, progressive
 from jscomb.denoisers import kernel_predicting
+from jscomb.frame import Estimate
 from jscomb.learning import networks
 from jscomb.numerics.convolution import convolve, convolve_doubled, doubled
 from jscomb.numerics.kernels import Kernels
@@ -140,6 +141,14 @@ def dsc_outputs(network, image):
     return jnp.concatenate([outputs(kernels), confidence], axis=-1)
 
 
+def ensemble_of(image):
+    """An image as what an ensemble's network sees of two bases."""
+    grey, two = image[..., :1], jnp.stack([image, 2 * image])
+    one = jnp.ones_like(two[..., :1])
+    guides = image, grey, jnp.zeros((*grey.shape[:2], 7)), 0 * image, 1 + 0 * grey
+    return ensemble.Candidates(*guides, two, two, one / 2, two[..., :2], one > 0)
+
+
 REACHES = {
     "body": (lambda: networks.UNet(key(), 3, size="light"), lambda n, i: n(i)),
     "njs": (
@@ -153,6 +162,10 @@ REACHES = {
     "pd": (
         lambda: networks.MixingNetwork(key(), size="light"),
         lambda n, i: n(i, 0 * i, i, i).reshape(*i.shape[:2], 9),
+    ),
+    "ensemble": (
+        lambda: waking(networks.EnsembleNetwork(key(), size="light")),
+        lambda n, i: n(ensemble_of(i)).sum(axis=0),
     ),
     "kernels": (
         lambda: networks.KernelPredictor(key(), features=3, window=3, size="light"),
@@ -196,6 +209,67 @@ def test_sizes_are_the_papers():
     for kind in (networks.JamesSteinNetwork, networks.MixingNetwork):
         light, full = (parameters_of(kind(key(), size=s)) for s in ("light", "full"))
         assert full / 4 < light < full / 3
+
+
+def waking(network):
+    """Return an ensemble's network whose logits are not zero, as they begin."""
+    width = network.exchange.kernel.shape[-1]
+    network.logit = networks.Convolution(key(), width, 1, size=1)
+    return network
+
+
+def bases_of(rng, count, size=(12, 8)):
+    """Return an ensemble's inputs of a number of bases."""
+    draw = lambda c: jnp.asarray(rng.random((*size, c)) + 0.5)
+    found = {"unbiased": draw(3), "variance": draw(3) / 10, "depth": draw(1)}
+    for k in range(count):
+        found |= {f"base{k}": draw(3), f"difference{k}": draw(3) / 10}
+        found |= {f"weight{k}": draw(1) / count, f"error{k}": draw(2) / 10}
+    return found
+
+
+def test_an_ensembles_order_does_not_matter(rng):
+    network, inputs = waking(networks.EnsembleNetwork(key(), size="light")), {}
+    inputs = bases_of(rng, 3)
+    turned = dict(inputs)
+    for name, image in inputs.items():
+        if name[-1].isdigit():
+            turned[f"{name[:-1]}{(int(name[-1]) + 1) % 3}"] = image
+    apply = jax.jit(ensemble.neural_weights)
+    weights = apply(network, inputs)
+    assert np.std(weights, axis=(0, 1)).min() > 1e-3  # the network does something
+    np.testing.assert_allclose(weights.sum(-1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        apply(network, turned), jnp.roll(weights, 1, axis=-1), rtol=1e-10
+    )
+
+
+def test_an_unknown_base_is_as_if_it_were_not_there(rng):
+    network = waking(networks.EnsembleNetwork(key(), size="light"))
+    inputs = bases_of(rng, 2)
+    more = inputs | {
+        f"{name[:-1]}2": jnp.full_like(image, jnp.nan)
+        for name, image in inputs.items()
+        if name.endswith("0")
+    }
+    wanted = ensemble.combine_inputs(network, inputs)
+    found = ensemble.combine_inputs(network, more)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
+def test_an_untrained_ensemble_is_the_multi_scale_one(glass_frame):
+    """But for the floor of its weights, which moves little."""
+    frame = glass_frame.normalised()
+    y = frame.estimates["oidn"]
+    own = Estimate(frame.color, jnp.stack([h.color for h in frame.halves()]))
+    given = {"oidn": y, "path-tracing": own}
+    network = networks.EnsembleNetwork(key(), size="light")
+    found = ensemble.neural_combine_frame(network, frame, given)
+    wanted = ensemble.combine_frame(frame, given)
+    scale = jnp.square(wanted.image) + 0.01
+    moved = jnp.mean(jnp.square(found.image - wanted.image) / scale)
+    between = jnp.mean(jnp.square(y.image - frame.color) / scale)
+    assert moved < 1e-3 * between
 
 
 def stub_kernels(weights, window):
@@ -313,6 +387,12 @@ NETWORKS = {
     "pd, direct": (
         functools.partial(networks.MixingNetwork, form="direct"),
         lambda n, x, y, v: progressive.neural_combine(n, x, y, v, v / 2, bound=False),
+    ),
+    "ensemble": (
+        lambda key, size: waking(networks.EnsembleNetwork(key, size=size)),
+        lambda n, x, y, v: ensemble.neural_combine(
+            n, *3 * [jnp.stack([x, y, 0.9 * y])], 1.1 * x, 0.9 * x, v
+        ),
     ),
     "kernels": (
         networks.KernelPredictor,

@@ -53,7 +53,7 @@ class Split(NamedTuple):
         random: number of random scenes.
         first: seed of the first one.
         reference_spp: samples a pixel of references.
-        counts: sample counts of every view; none for three drawn ones.
+        counts: sample counts of every view; none for five drawn ones.
     """
 
     scenes: tuple[str, ...]
@@ -168,15 +168,16 @@ def counts(view: View) -> list[int]:
         view: which.
 
     Returns:
-        of its split, or one each of few, some and many samples.
+        of its split, or two of few, two of some and one of many samples: the few cost
+        little beside the many and the reference.
     """
     fixed = SPLITS[view.split].counts
     if fixed:
         more = fixed[-1] * 4  # every other view reaches farther
         return [*fixed, more] if view.seed % 2 == 0 else list(fixed)
     rng = np.random.default_rng([_number(view), 0xC0417])
-    drawn = rng.choice(LOW), rng.choice(MIDDLE), rng.choice(HIGH, p=RARE)
-    return [int(count) for count in drawn]
+    some = [rng.choice(group, 2, replace=False) for group in (LOW, MIDDLE)]
+    return [int(n) for n in (*np.ravel(some), rng.choice(HIGH, p=RARE))]
 
 
 def frames(folder: pathlib.Path, split: str) -> Iterator[tuple[str, int, pathlib.Path]]:

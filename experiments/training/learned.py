@@ -25,6 +25,7 @@ from experiments.common.tables import table
 from experiments.data import dataset
 from experiments.training.train import ALL
 from jscomb import exr
+from jscomb.cli import with_bases
 from jscomb.learning import recipes
 from jscomb.learning.examples import draw_losses
 from jscomb.typing import Image
@@ -109,8 +110,8 @@ def measure(path: pathlib.Path, trained: Mapping[str, Trained]) -> dict[str, flo
         recipe = ALL[method]
         if recipe.estimate not in frame.estimates:
             continue
-        estimate = frame.estimates[recipe.estimate]
-        inputs = recipe.inputs(jax.random.key(0), frame, estimate)
+        estimate, seen = frame.estimates[recipe.estimate], with_bases(recipe, frame)
+        inputs = recipe.inputs(jax.random.key(0), seen, estimate)
         combine = _compiled(recipe.combine)
         images[f"{name}, {TRAINED}"] = combine(network, inputs)
         images[f"{name}, {UNTRAINED}"] = combine(untrained, inputs)

@@ -19,9 +19,24 @@ from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
 from jscomb.cli._rendering import render, render_file
 from jscomb.cli._showing import compare, demo, info
-from jscomb.cli._training import Run, prepare, split_files, train, train_files
+from jscomb.cli._training import (
+    Run,
+    prepare,
+    split_files,
+    train,
+    train_files,
+    with_bases,
+)
 
-__all__ = ["Run", "main", "prepare", "render_file", "split_files", "train_files"]
+__all__ = [
+    "Run",
+    "main",
+    "prepare",
+    "render_file",
+    "split_files",
+    "train_files",
+    "with_bases",
+]
 
 
 def main() -> None:

@@ -21,6 +21,8 @@ import tyro
 from tqdm import tqdm
 
 from jscomb import exr
+from jscomb.frame import Frame
+from jscomb.methods import with_inputs
 
 if TYPE_CHECKING:  # flax is slow to import
     from jscomb.learning import training
@@ -84,8 +86,8 @@ def train(
     frames it is not trained on, its card, the losses and a plot of them.
 
     Args:
-        method: njs, dsc, dsc-photons, pd, kernels (a denoiser) or kernels-njs (a
-            denoiser and its combiner, jointly).
+        method: njs, dsc, dsc-photons, pd, neural-ensemble, kernels (a denoiser) or
+            kernels-njs (a denoiser and its combiner, jointly).
         data: folder of frames.
         out: folder of the run.
         validation: folder of frames of other scenes to validate on.
@@ -264,6 +266,8 @@ def prepare(
         kept = cache / f"{file.stem}.npz"
         if not kept.exists():
             frame = exr.read_frame(file)
+            if recipe.bases:
+                frame = with_bases(recipe, frame)
             try:
                 made: Any = examples.make_inputs(recipe, frame, variants=variants)
             except ValueError as error:
@@ -276,6 +280,19 @@ def prepare(
     if not found:
         raise ValueError(f"no frame of {piece} x {piece} pixels or more with light")
     return examples.stack_examples(found)
+
+
+def with_bases(recipe: "Recipe", frame: Frame) -> Frame:
+    """Return a frame with the estimates that a recipe's inputs are made of.
+
+    Args:
+        recipe: of a network.
+        frame: in any unit.
+
+    Returns:
+        the frame, normalised.
+    """
+    return with_inputs(jax.random.key(0), frame.normalised(), recipe.bases)
 
 
 def _scene(file: pathlib.Path) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.features import stack
+from jscomb.features import FEATURES, stack
 from jscomb.frame import Frame, Needs
 from jscomb.numerics.guards import (
     check_same_shape,
@@ -30,9 +30,7 @@ __all__ = ["NEEDS", "denoise", "denoise_inputs", "denoise_normalised", "neural_i
 Features = Float[Array, "h w f"]
 Network = Callable[[Image, Variance, Features], Kernels]
 
-_FEATURES = {"albedo": 3, "normal": 3, "depth": 1}  # channels
-
-NEEDS = Needs(variance=True, channels=3, features=tuple(_FEATURES), normalised=True)
+NEEDS = Needs(variance=True, channels=3, features=tuple(FEATURES), normalised=True)
 
 
 def denoise(
@@ -137,7 +135,7 @@ def neural_inputs(frame: Frame) -> dict[str, Image]:
     frame.require("a kernel predictor", NEEDS)
     images = {"noisy": frame.color, "variance": frame.variance}
     features, first = stack(frame), 0
-    for name, channels in _FEATURES.items():
+    for name, channels in FEATURES.items():
         images[name] = features[..., first : first + channels]
         first += channels
     return images
@@ -162,6 +160,6 @@ def denoise_inputs(network: Network, inputs: Mapping[str, Image]) -> Image:
         >>> print(denoise_inputs(even, inputs)[0, :, 0])
         [1.5 3.  4. ]
     """
-    features = jnp.concatenate([inputs[name] for name in _FEATURES], axis=-1)
+    features = jnp.concatenate([inputs[name] for name in FEATURES], axis=-1)
     noisy, variance = inputs["noisy"], inputs["variance"]
     return denoise_normalised(network, noisy, variance, features)

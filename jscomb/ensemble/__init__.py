@@ -25,6 +25,10 @@ are local, with few there is almost one weight a base for the frame. A pixel who
 buffer is noisy has less weight in these means; weights vary slowly, so they are solved
 for in blocks of 4x4 pixels and interpolated.
 
+A network can correct these weights pixel by pixel (`neural_combine`): it sees the
+bases, x, its variance, the features and the error matrix, and gives each base a factor.
+Bases are alike to it: any number, in any order.
+
 Consistent if one base is: its error vanishes as samples grow, and so does the minimum.
 
 Weights learn from both halves. So the halves of an ensemble are independent only where
@@ -52,19 +56,39 @@ from jscomb.ensemble._frame import (
     stack_estimates,
     weigh_frame,
 )
+from jscomb.ensemble._neural import (
+    NEURAL_NEEDS,
+    Candidates,
+    candidates,
+    combine_inputs,
+    neural_combine,
+    neural_combine_frame,
+    neural_inputs,
+    neural_weights,
+    plan_neural_weights,
+)
 from jscomb.ensemble._selection import Selected, select_bases
 
 __all__ = [
     "NEEDS",
+    "NEURAL_NEEDS",
+    "Candidates",
     "Selected",
     "Stacked",
     "average",
+    "candidates",
     "combine",
     "combine_frame",
+    "combine_inputs",
     "error_matrix",
     "filter_weights",
     "mse_matrix",
+    "neural_combine",
+    "neural_combine_frame",
+    "neural_inputs",
+    "neural_weights",
     "one_hot",
+    "plan_neural_weights",
     "select_bases",
     "solve_weights",
     "spread",

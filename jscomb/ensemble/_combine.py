@@ -183,7 +183,7 @@ def solve_weights(
             shared=shared,
             block=block,
         )
-        weights = _interpolated(simplex.quadratic(matrix), block)
+        weights = interpolated(simplex.quadratic(matrix), block)
         height, width = biased_a.shape[1:3]
         return jnp.broadcast_to(weights[:, :height, :width], biased_a.shape)
     _, *clean = zero_invalid(*images)
@@ -198,8 +198,8 @@ def solve_weights(
     return simplex.iterative(solver_key, *clean)
 
 
-def _interpolated(weights: Blocks, block: int) -> Bases:
-    """Weights of every pixel from those of blocks: smooth, without a seam."""
+def interpolated(weights: Blocks, block: int) -> Bases:
+    """Values of every pixel from those of blocks: smooth, without a seam."""
     if block == 1:
         return weights
     window = 2 * round(2 * _SMOOTH) - 1

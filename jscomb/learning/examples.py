@@ -17,7 +17,7 @@ from jscomb import metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame
 from jscomb.learning import recipes, training
-from jscomb.learning.recipes import Network, Recipe
+from jscomb.learning.recipes import Inputs, Network, Recipe
 from jscomb.typing import Image, Scalar
 
 __all__ = [
@@ -31,12 +31,7 @@ __all__ = [
     "validate",
 ]
 
-_COMBINED = (
-    "unbiased",
-    "biased",
-    "biased_a",
-    "noisy",
-)  # images among a recipe's inputs
+_COMBINED = "unbiased", "biased", "biased_a", "noisy", "base"  # among the inputs
 _LEAST = 0.02  # of the better input's error: less is not known from noisy references
 
 Arrays = Mapping[str, np.ndarray]
@@ -63,8 +58,8 @@ def make_inputs(
 
     Args:
         recipe: of the network.
-        frame: with a reference with halves; with the recipe's estimate, unless that is
-            oidn, which is made where it is missing.
+        frame: with a reference with halves; with the recipe's bases and estimate,
+            unless that is oidn, which is made where it is missing.
         variants: all of the recipe's inputs, not only the first.
 
     Returns:
@@ -87,6 +82,8 @@ def make_inputs(
         raise ValueError("training needs a reference with halves")
     if not float(jnp.median(frame.reference.image)) > 0:
         return {}
+    if lacking := set(recipe.bases) - set(frame.estimates):
+        raise ValueError(f"training needs estimates {', '.join(sorted(lacking))}")
     frame = frame.normalised()
     estimate = _estimate(frame, recipe.estimate)
     assert frame.reference is not None
@@ -97,7 +94,7 @@ def make_inputs(
     makers = (recipe.inputs, *(recipe.others if variants else ()))
     made = [make(jax.random.key(0), frame, estimate) for make in makers]
     better = [
-        min(_error(each[name], halves) for name in _COMBINED if name in each)
+        min(_error(image, halves) for image in _combined(each).values())
         for each in made
     ]
     inputs = {name: np.stack([m[name] for m in made]) for name in made[0]}
@@ -257,6 +254,15 @@ def draw_losses(axes: Any, card: Mapping[str, Any], *, title: str) -> Any:
     axes.axvline(card["best_step"], color="0.7", label="best step")
     axes.set(xlabel="step", yscale="log", title=title)
     return axes
+
+
+def _combined(inputs: Inputs) -> Inputs:
+    """The images that are combined, of what is known."""
+    return {
+        name: image
+        for name, image in inputs.items()
+        if recipes.kind(name) in _COMBINED and not jnp.all(jnp.isnan(image))
+    }
 
 
 def _error(image: Image, halves: Array) -> Scalar:

@@ -25,22 +25,20 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jscomb.double_shrinkage import Filters
+from jscomb.ensemble import Candidates
+from jscomb.features import FEATURES
 from jscomb.james_stein import Parameters, Rule
 from jscomb.learning.losses import compress
-from jscomb.numerics.convolution import doubled
+from jscomb.learning.unet import WIDTHS, Headed, Size, UNet
+from jscomb.numerics.guards import weighted_ratio
 from jscomb.numerics.kernels import Kernels
-from jscomb.numerics.layers import (
-    Convolution,
-    apply_each,
-    halved,
-    reach_of,
-    unet_reach,
-)
+from jscomb.numerics.layers import Convolution, apply_each, reach_of
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Key, Variance
 
 __all__ = [
     "Convolution",
+    "EnsembleNetwork",
     "JamesSteinNetwork",
     "Joint",
     "KernelPredictor",
@@ -50,95 +48,18 @@ __all__ = [
     "UNet",
 ]
 
-Size = Literal["light", "full"]
 Form = Literal["quotient", "direct"]
 Serves = Literal["denoised", "independent", "any"]
 
-_WIDTHS = {"full": (32, 64, 128), "light": (16, 32, 64)}  # of a U-Net's levels
 _MIXING_WIDTH = {"full": 48, "light": 24}
 _MINIMUM_WEIGHT = 1e-4  # NJS adds it to its weights
 _MAXIMUM_EXPONENT = 30.0  # of a confidence; beyond it the prior has no weight
 _VARIANCE_UNIT = 0.01  # squared normalised radiance
+_SQUARE_UNIT = 1e-4  # squared relative error
 _PAPER = Rule()
 
 
-class UNet(nnx.Module):
-    """Three levels of two convolutions, with max pooling down and repetition up.
-
-    Attributes:
-        down: convolutions of each level on the way down.
-        up: convolutions of each level on the way up, coarsest first.
-
-    Example:
-        >>> body = UNet(jax.random.key(0), 3, size="light")
-        >>> print(jax.eval_shape(body, jnp.ones((7, 5, 3))).shape)
-        (7, 5, 16)
-        >>> print(body.reach, body.multiple)
-        23 4
-    """
-
-    def __init__(self, key: Key, inputs: int, *, size: Size = "full"):
-        """Draw all convolutions."""
-        widths = _WIDTHS[size]
-        keys = iter(jax.random.split(key, 4 * len(widths)))
-
-        def pair(before: int, after: int):
-            first = Convolution(next(keys), before, after)
-            return nnx.List([first, Convolution(next(keys), after, after)])
-
-        befores = (inputs, *widths[:-1])
-        self.down = nnx.List([pair(*w) for w in zip(befores, widths, strict=True)])
-        rising = list(zip(widths[:0:-1], widths[-2::-1], strict=True))
-        self.up = nnx.List([pair(below + w, w) for below, w in rising])
-
-    @property
-    def multiple(self) -> int:
-        """Width of the blocks of pixels that are pooled to one."""
-        return 2 ** len(self.up)
-
-    @property
-    def reach(self) -> int:
-        """Distance of the farthest pixel that some pixel of a block depends on."""
-        return unet_reach(self.down, self.up)
-
-    def __call__(self, image: Float[Array, "h w _"]) -> Float[Array, "h w _"]:
-        """Return features of every pixel, at least zero, as wide as the first level.
-
-        Pads images that are not whole blocks with zeros.
-        """
-        height, width, _ = image.shape
-        block = self.multiple
-        image = jnp.pad(image, ((0, -height % block), (0, -width % block), (0, 0)))
-        levels = []
-        for convolutions in self.down:
-            image = halved(levels[-1]) if levels else image
-            levels.append(apply_each(convolutions, image))
-        image = levels.pop()
-        for convolutions in self.up:
-            finer = levels.pop()
-            both = jnp.concatenate([doubled(image), finer], axis=-1)
-            image = apply_each(convolutions, both)
-        return image[:height, :width]
-
-
-class _Headed(nnx.Module):
-    """A U-Net with convolutions side by side on its features."""
-
-    body: UNet
-
-    @property
-    def multiple(self) -> int:
-        """Width of the blocks of pixels that are pooled to one."""
-        return self.body.multiple
-
-    @property
-    def reach(self) -> int:
-        """Distance of the farthest pixel that the outputs of a pixel depend on."""
-        heads = [h for h in vars(self).values() if isinstance(h, Convolution)]
-        return self.body.reach + max(head.reach for head in heads)
-
-
-class JamesSteinNetwork(_Headed):
+class JamesSteinNetwork(Headed):
     """Which variance each window has, and which half's regression to trust.
 
     Attributes:
@@ -162,7 +83,7 @@ class JamesSteinNetwork(_Headed):
     ):
         """Draw all convolutions."""
         body, kernels, share = jax.random.split(key, 3)
-        width = _WIDTHS[size][0]
+        width = WIDTHS[size][0]
         self.window, self.rule = window, rule
         self.body = UNet(body, 12, size=size)
         self.kernels = Convolution(kernels, width, check_window(window) ** 2)
@@ -184,7 +105,7 @@ class JamesSteinNetwork(_Headed):
         return Parameters(kernels, alpha)
 
 
-class ShrinkageNetwork(_Headed):
+class ShrinkageNetwork(Headed):
     """How to pool the errors of two integrators, and how far to trust the prior.
 
     Attributes:
@@ -210,7 +131,7 @@ class ShrinkageNetwork(_Headed):
     ):
         """Draw all convolutions."""
         body, kernels, confidence = jax.random.split(key, 3)
-        width = _WIDTHS[size][0]
+        width = WIDTHS[size][0]
         self.body = UNet(body, 11, size=size)
         self.window, self.serves = window, serves
         weights = 2 * check_window(window) ** 2
@@ -295,7 +216,79 @@ class MixingNetwork(nnx.Module):
         return outputs.reshape(*outputs.shape[:2], 3, 3)
 
 
-class KernelPredictor(_Headed):
+class EnsembleNetwork(Headed):
+    """How much more or less of each base of an ensemble to take.
+
+    One U-Net sees every base by itself; then each learns of the others by the mean of
+    their features. So bases are alike: any number, in any order. Untrained it leaves
+    the ensemble's weights as they are.
+
+    Attributes:
+        body: U-Net.
+        exchange: projection of a base's features and the mean of all.
+        logit: projection to one number a base.
+
+    Example:
+        >>> network = EnsembleNetwork(jax.random.key(0), size="light")
+        >>> one = lambda *shape: jnp.ones((*shape[:-1], 6, 4, shape[-1]))
+        >>> guide = [one(3), one(1), one(7), one(3), one(1)]
+        >>> bases = [one(2, 3), one(2, 3), one(2, 1), one(2, 2), one(2, 1) > 0]
+        >>> print(jax.eval_shape(network, Candidates(*guide, *bases)).shape)
+        (2, 6, 4, 1)
+
+    Source: ours; M. Zaheer et al., "Deep sets", 2017.
+    """
+
+    def __init__(self, key: Key, *, size: Size = "full"):
+        """Draw all convolutions."""
+        body, exchange, logit = jax.random.split(key, 3)
+        width = WIDTHS[size][0]
+        self.body = UNet(body, 16 + sum(FEATURES.values()), size=size)
+        self.exchange = Convolution(exchange, 2 * width, width, size=1)
+        self.logit = Convolution(logit, width, 1, size=1)
+        self.logit.kernel = nnx.Param(jnp.zeros_like(self.logit.kernel[...]))
+
+    def __call__(self, seen: Candidates) -> Float[Array, "n h w 1"]:
+        """Return a logit of each base for `ensemble.neural_weights`."""
+        relative = lambda square: _compress_square(square / seen.square)
+        mean = lambda i: jnp.mean(jnp.square(i), axis=-1, keepdims=True)
+        spread = jnp.sum(seen.weights * mean(seen.bases - seen.blend[None]), axis=0)
+        common = [
+            compress(seen.unbiased),
+            relative(seen.variance),
+            relative(spread),
+            seen.features,
+        ]
+
+        def features(base: tuple[Array, ...]) -> Array:
+            """Of one base by itself."""
+            y, difference, weight, errors = base
+            image = [
+                compress(y),
+                compress((y - seen.blend) / jnp.sqrt(seen.square)),
+                relative(mean(y - seen.unbiased)),
+                relative(mean(difference) / 4),
+                weight,
+                jnp.sign(errors) * _compress_square(jnp.abs(errors)),
+            ]
+            return self.body(jnp.concatenate([*common, *image], axis=-1))
+
+        each = seen.bases, seen.differences, seen.weights, seen.errors
+        own = jax.vmap(features)(each)
+        present = seen.present.astype(own.dtype)
+        others = weighted_ratio(
+            jnp.sum(present * own, axis=0), jnp.sum(present, axis=0)
+        )
+
+        def logit(features: Array) -> Array:
+            """Of one base among the others."""
+            both = jnp.concatenate([features, others], axis=-1)
+            return self.logit(jax.nn.relu(self.exchange(both)))
+
+        return jax.vmap(logit)(own)
+
+
+class KernelPredictor(Headed):
     """A small kernel-predicting denoiser: an image to learn jointly with a combiner.
 
     Attributes:
@@ -324,7 +317,7 @@ class KernelPredictor(_Headed):
         self.body = UNet(body, 6 + features, size=size)
         self.window = window
         weights = check_window(window) ** 2
-        self.kernels = Convolution(kernels, _WIDTHS[size][0], weights)
+        self.kernels = Convolution(kernels, WIDTHS[size][0], weights)
 
     def __call__(
         self, unbiased: Image, variance: Variance, features: Float[Array, "h w f"]
@@ -364,6 +357,11 @@ class Joint(nnx.Module):
 def _compress_variance(variance: Array) -> Array:
     """Return the logarithm of a variance, steep where typical variances are."""
     return jnp.log1p(variance / _VARIANCE_UNIT)
+
+
+def _compress_square(square: Array) -> Array:
+    """Return the logarithm of a squared relative error, steep above one percent."""
+    return jnp.log1p(square / _SQUARE_UNIT) / 4
 
 
 def _softmax(logits: Array, *, parts: int) -> Array:

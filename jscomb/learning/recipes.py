@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb import double_shrinkage, james_stein, progressive
+from jscomb import double_shrinkage, ensemble, james_stein, progressive
 from jscomb.denoisers import bilateral, kernel_predicting, oidn
-from jscomb.features import stack
+from jscomb.features import FEATURES, stack
 from jscomb.frame import Estimate, Frame
 from jscomb.learning import checkpoints, losses, networks
 from jscomb.numerics import luminance
@@ -27,11 +27,13 @@ from jscomb.numerics.tiles import compiled
 from jscomb.typing import Image, Key, Scalar
 
 __all__ = [
+    "BASES",
     "RECIPES",
     "WEIGHTS",
     "Recipe",
     "exchanged",
     "in_unit",
+    "kind",
     "load_network",
     "of_mean",
     "options_of",
@@ -49,7 +51,13 @@ WEIGHTS = pathlib.Path(str(importlib.resources.files("jscomb.learning"))) / "wei
 
 # By which power of a unit of radiance inputs are divided; the others by the first.
 _POWERS = {"variance": 2, "sure": 2, "mse": 2, "noise": 2}
-_POWERS |= {"albedo": 0, "normal": 0, "depth": 0}
+_POWERS |= {"albedo": 0, "normal": 0, "depth": 0, "weight": 0, "error": 0}
+
+BASES = (
+    *("oidn", "path-tracing", "oidn-demodulated", "nonlocal-means"),
+    *("whitened", "multi-scale"),
+)
+"""What the ensembles are made of that a network is trained on, by method."""
 
 
 class Recipe(NamedTuple):
@@ -63,6 +71,7 @@ class Recipe(NamedTuple):
         options: of the network: what it is for, in words that a card can hold.
         estimate: name of the frame's estimate that it combines.
         without: the estimator without a network, from the same inputs.
+        bases: estimates that the frame must have besides, by method.
         others: inputs in place of `inputs` that training draws as often.
         training: options of `combine` while training.
     """
@@ -74,6 +83,7 @@ class Recipe(NamedTuple):
     options: Mapping[str, Any] = types.MappingProxyType({})
     estimate: str = "oidn"
     without: Callable[[Inputs], Image] | None = None
+    bases: tuple[str, ...] = ()
     others: tuple[MakeInputs, ...] = ()
     training: Mapping[str, Any] = types.MappingProxyType({})
 
@@ -146,9 +156,25 @@ def in_unit(inputs: Mapping[str, Image], unit: Scalar) -> Inputs:
         {'unbiased': 0.5, 'variance': 0.25, 'depth': 1.0}
     """
     return {
-        name: luminance.in_unit(image, unit, power=_POWERS.get(name, 1))
+        name: luminance.in_unit(image, unit, power=_POWERS.get(kind(name), 1))
         for name, image in inputs.items()
     }
+
+
+def kind(name: str) -> str:
+    """Return the name of an input without the number of its base.
+
+    Args:
+        name: such as base0.
+
+    Returns:
+        the name, such as base.
+
+    Example:
+        >>> print(kind("base0"), kind("biased_a"))
+        base biased_a
+    """
+    return name.rstrip("0123456789")
 
 
 def _double_shrinkage(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
@@ -172,6 +198,31 @@ def _progressive(
 def _bilateral(color: Image, frame: Frame) -> Image:
     """Denoise a colour by a filter that knows the features."""
     return compiled(bilateral.denoise)(color, frame.variance, stack(frame))
+
+
+def _ensemble(
+    key: Key,
+    frame: Frame,
+    estimate: Estimate,
+    *,
+    bases: tuple[str, ...] = BASES,
+    features: bool = True,
+) -> Inputs:
+    """Return an ensemble's inputs; bases that it lacks are unknown at every pixel."""
+    del key, estimate
+    found = ensemble.neural_inputs(frame, {n: frame.estimates[n] for n in bases})
+    for number in range(len(bases), len(BASES)):
+        for name in [n for n in found if n.endswith("0")]:
+            unknown = jnp.full_like(found[name], jnp.nan)
+            found[f"{kind(name)}{number}"] = unknown
+    if features:
+        return found
+    return found | {n: jnp.zeros_like(found[n]) for n in FEATURES if n in found}
+
+
+def _ensemble_without(inputs: Mapping[str, Image]) -> Image:
+    """With the multi-scale weights as they are."""
+    return ensemble.candidates(inputs).blend
 
 
 def _kernel_predicting(key: Key, frame: Frame, estimate: Estimate) -> Inputs:
@@ -252,6 +303,17 @@ RECIPES = {
         without=_progressive_without,
         others=(*_PD[1:], *map(exchanged, _PD[:2])),
         training={"bound": False, "limit": False},
+    ),
+    "neural-ensemble": Recipe(
+        networks.EnsembleNetwork,
+        _ensemble,
+        ensemble.combine_inputs,
+        without=_ensemble_without,
+        bases=BASES,
+        others=(
+            functools.partial(_ensemble, bases=BASES[:2], features=False),
+            functools.partial(_ensemble, bases=(*BASES[1:4], BASES[5])),
+        ),
     ),
     "kernels": Recipe(
         networks.KernelPredictor,

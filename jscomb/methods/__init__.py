@@ -11,7 +11,7 @@ what was combined, and the estimated error.
 """
 
 from jscomb.methods._combine import combine, plan
-from jscomb.methods._inputs import input_name, inputs
+from jscomb.methods._inputs import input_name, inputs, with_inputs
 from jscomb.methods._table import BASES, METHODS, Method, table
 from jscomb.methods._tiers import TIERS, Combined, Tier, combine_tier
 
@@ -28,6 +28,7 @@ __all__ = [
     "inputs",
     "plan",
     "table",
+    "with_inputs",
 ]
 
 __doc__ = f"{__doc__}\n{table()}\n"

@@ -157,7 +157,25 @@ def with_input(key: Key, frame: Frame, name: str) -> Frame:
 
 
 def with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
-    """The frame with estimates, made if they are not there, some of them together."""
+    """Return the frame with estimates, made if they are not there.
+
+    Args:
+        key: of random probes, a typed key.
+        frame: normalised.
+        names: of the frame's estimates, or of methods.
+
+    Returns:
+        the frame with all of them; those of one kind are made together.
+
+    Raises:
+        ValueError: if the frame lacks what a method needs.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> frame = make_frame(jnp.ones((2, 4, 4, 3))).normalised()
+        >>> print(*with_inputs(jax.random.key(0), frame, ["path-tracing"]).estimates)
+        path-tracing
+    """
     made = {n: METHODS[n].variant for n in names if n not in frame.estimates}
     variants = {n: variant for n, variant in made.items() if variant is not None}
     if variants:

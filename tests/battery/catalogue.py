@@ -89,6 +89,19 @@ def _ensemble(r: Rendering, **options: Any) -> Image:
     return ensemble.combine((a + b) / 2, *halves, **guides, **options)
 
 
+def _candidates(r: Rendering) -> dict[str, jax.Array]:
+    """What a network sees of the unbiased and the biased image."""
+    one = jnp.ones_like(r.grey)
+    pairs = (r.unbiased_a, r.unbiased_b), (r.biased_a, r.biased_b)
+    found = {"unbiased": r.unbiased, "variance": r.variance}
+    found |= {"albedo": r.features[..., :3], "normal": r.features[..., 3:6]}
+    for k, (a, b) in enumerate(pairs):
+        found |= {f"base{k}": (a + b) / 2, f"difference{k}": a - b}
+        errors = jnp.concatenate([k * one, one - k], axis=-1)
+        found |= {f"weight{k}": (1 + k) / 3 * one, f"error{k}": errors}
+    return found
+
+
 def _by(solve: Callable[..., jax.Array]) -> Callable[[Rendering], Image]:
     """The bases' mean with the weights of a solver of points and targets.
 
@@ -155,10 +168,14 @@ def combiners() -> dict[str, Entry]:
         networks.JamesSteinNetwork,
         networks.ShrinkageNetwork,
         networks.MixingNetwork,
+        networks.EnsembleNetwork,
     )
     keys = jax.random.split(jax.random.key(0), len(kinds))
-    njs, dsc, pd = (n(key, size="light") for n, key in zip(kinds, keys, strict=True))
+    njs, dsc, pd, mixed = (
+        n(key, size="light") for n, key in zip(kinds, keys, strict=True)
+    )
     njs.rule, pd.form = james_stein.Rule(window=7, whiten=True), "direct"
+    mixed.logit = networks.Convolution(keys[-1], 16, 1, size=1)  # untrained it is 0
     xyv = lambda r: (r.unbiased, r.biased, r.variance)
     halves = lambda r: (r.unbiased_a, r.unbiased_b, r.biased_a, r.biased_b)
     known = lambda r: finite(r.unbiased, r.biased)  # so that derivatives are, too
@@ -199,6 +216,11 @@ def combiners() -> dict[str, Entry]:
         "ensemble.combine": Entry(_ensemble, rounding=1e-4),
         "ensemble.combine multi-scale": Entry(
             lambda r: _ensemble(r, solver="multi-scale", windows=(7, 11))
+        ),
+        "ensemble.combine_inputs": Entry(
+            _normalised(lambda r: ensemble.combine_inputs(mixed, _candidates(r))),
+            mixed.reach,
+            multiple=mixed.multiple,
         ),
         "uncorrelated.combine": Entry(_uncorrelated(uncorrelated.combine, 2), 7),
         "uncorrelated.combine_crosswise": Entry(
