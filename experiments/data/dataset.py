@@ -10,7 +10,7 @@ run. `--sheet` prints what is there.
 Splits are by scene: no view of a scene that is trained on is in another split. The test
 split is for final figures only; choices are made on the validation split.
 
-References of training views are noisy; those of validation and test views have four
+References of training views are noisy; those of validation and test views have eight
 times the samples, and `metrics.rel_l2` subtracts the noise that is left.
 """
 
@@ -41,7 +41,7 @@ VIEWS_A_PROCESS = 8
 PHOTONS_A_PASS = 100_000
 PASSES = (8, 16, 32)  # of photon mapping
 LOW, MIDDLE, HIGH = (4, 8, 16), (32, 64, 128), (256, 512, 1024, 2048, 4096)
-RARE = (0.5, 0.25, 0.15, 0.07, 0.03)  # probabilities of HIGH: cost grows with samples
+RARE = (0.7, 0.2, 0.07, 0.02, 0.01)  # probabilities of HIGH: cost grows with samples
 
 
 class Split(NamedTuple):
@@ -53,7 +53,8 @@ class Split(NamedTuple):
         random: number of random scenes.
         first: seed of the first one.
         reference_spp: samples a pixel of references.
-        counts: sample counts of every view; none for five drawn ones.
+        counts: sample counts of every view; none for all of few and some samples, and
+            a drawn one of many.
     """
 
     scenes: tuple[str, ...]
@@ -70,7 +71,7 @@ SPLITS = {
         variations=17,
         random=96,
         first=1000,
-        reference_spp=512,
+        reference_spp=256,
     ),
     "validate": Split(
         ("dining-room", "veach-mis"),
@@ -168,16 +169,15 @@ def counts(view: View) -> list[int]:
         view: which.
 
     Returns:
-        of its split, or two of few, two of some and one of many samples: the few cost
-        little beside the many and the reference.
+        of its split, or all of few and some samples, which cost little beside the one
+        of many and the reference.
     """
     fixed = SPLITS[view.split].counts
     if fixed:
         more = fixed[-1] * 4  # every other view reaches farther
         return [*fixed, more] if view.seed % 2 == 0 else list(fixed)
     rng = np.random.default_rng([_number(view), 0xC0417])
-    some = [rng.choice(group, 2, replace=False) for group in (LOW, MIDDLE)]
-    return [int(n) for n in (*np.ravel(some), rng.choice(HIGH, p=RARE))]
+    return [*LOW, *MIDDLE, int(rng.choice(HIGH, p=RARE))]
 
 
 def frames(folder: pathlib.Path, split: str) -> Iterator[tuple[str, int, pathlib.Path]]:

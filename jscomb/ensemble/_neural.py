@@ -149,6 +149,7 @@ def neural_combine_frame(
         ValueError: if frame or estimates lack what is needed, or shapes differ.
 
     Example:
+        >>> import jax
         >>> from jscomb.frame import make_frame
         >>> x = 2 + 0.1 * jax.random.normal(jax.random.key(0), (4, 8, 8, 3))
         >>> frame = make_frame(x).normalised()

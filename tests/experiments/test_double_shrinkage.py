@@ -1,12 +1,15 @@
 """The experiments in `double_shrinkage` run, and say what they measured."""
 
+import shutil
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.double_shrinkage import error, photon_mapping
+from experiments.double_shrinkage import error, photon_mapping, photons
 from jscomb import metrics
 from jscomb.denoisers import oidn
+from tests.conftest import DATA
 
 
 @pytest.mark.slow
@@ -58,3 +61,15 @@ def test_photon_mapping_is_that_of_a_scene(vectorised):
     (row,) = rows.values()
     assert abs(row["frame"]) < 0.2
     assert "of 1 scenes" in photon_mapping.report(rows).answer
+
+
+@pytest.mark.slow
+def test_combiners_of_photons_are_measured(tmp_path):
+    (tmp_path / "test").mkdir()
+    shutil.copy(DATA / "unseen-random-3001-256.exr", tmp_path / "test")
+    found = photons.run(photons.Config(tmp_path, quick=True))
+    (row,) = found.values()
+    better = min(row["path-tracing"], row["photons"])
+    assert row["dsc"] < row["double-shrinkage"] < better
+    said = photons.report(found).answer
+    assert f"ensemble with all {row['ensemble with all'] / better:.3f}" in said

@@ -1,5 +1,7 @@
 """The experiments in `james_stein` run, and say what they measured."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,11 @@ from experiments.james_stein import (
     error,
     parts,
     regression,
+    weak_denoisers,
 )
-from jscomb import metrics
+from jscomb import exr, metrics
+from jscomb.denoisers import oidn
+from tests.conftest import DATA
 
 
 def test_errors_are_those_of_the_metrics(folder, glass_frame):
@@ -63,3 +68,23 @@ def test_ratios_are_to_the_first_setting():
     ratios = regression.ratios(found)
     assert ratios["stride 1, 51x51"] == (1, 1, 1)
     np.testing.assert_allclose(ratios["stride 2"], (1, 2, 0.25))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+def test_weak_denoisers_are_measured(tmp_path):
+    (tmp_path / "test").mkdir()
+    shutil.copy(DATA / "unseen-random-3004-256.exr", tmp_path / "test")
+    found = weak_denoisers.run(weak_denoisers.Config(tmp_path, quick=True))
+    (frame, row), *_ = found.items()
+    assert frame == "unseen-random-3004 256"
+    assert row.keys() == set(weak_denoisers.DENOISERS)
+    stored = exr.read_frame(tmp_path / "test" / "unseen-random-3004-256.exr")
+    stored = stored.normalised()
+    r, noise = stored.reference
+    expected = metrics.rel_l2(stored.color, r, half_difference=noise)
+    for errors in row.values():
+        np.testing.assert_allclose(errors["path-tracing"], expected, rtol=1e-3)
+        assert errors["multi-scale"] < errors["alone"]
+    ratio = row["nfor"]["multi-scale"] / row["nfor"]["alone"]
+    assert f"nfor {ratio:.2f} at 256 samples" in weak_denoisers.report(found).answer

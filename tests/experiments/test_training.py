@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.training import cost, learned, ship, train
+from experiments.training import cost, joint, learned, ship, train
 from jscomb import cli, exr, metrics
 from jscomb.denoisers import oidn
 from jscomb.learning import examples, networks, recipes
@@ -137,3 +137,25 @@ def test_only_a_run_of_the_method_is_shipped(tmp_path):
     with pytest.raises(ValueError, match="is a run of pd-smape"):
         ship.run(config)
     assert not config.out.exists()
+
+
+@pytest.mark.slow
+def test_joint_training_is_measured_beside_training_apart(crops, unseen, tmp_path):
+    """The fixed denoiser stays what it was; every image is one of the frame's."""
+    data = tmp_path / "data"
+    for split, files in (
+        ("train", crops.glob("*-1024.exr")),
+        ("validate", crops.glob("*-64.exr")),
+    ):
+        (data / split).mkdir(parents=True)
+        for file in files:
+            shutil.copy(file, data / split)
+    shutil.copytree(unseen / "test", data / "test")
+    found = joint.run(joint.Config(data, out=tmp_path / "runs", quick=True))
+    assert set(found.cards) == {joint.ALONE, joint.APART, joint.JOINT}
+    for row in found.rows.values():
+        assert all(np.isfinite(list(row.values())))
+        # Little is learned here, so James-Stein takes path tracing's side.
+        assert row[joint.WHITENED] < row[joint.DENOISED]
+    mean = joint.report(found).answer
+    assert joint.TRAINED_JOINTLY in mean
