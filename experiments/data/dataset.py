@@ -194,7 +194,7 @@ def frames(folder: pathlib.Path, split: str) -> Iterator[tuple[str, int, pathlib
         ValueError: if there are none.
     """
     found = []
-    for path in (folder / split).glob("*.exr"):
+    for path in (folder / split).glob("[!.]*.exr"):
         view, _, samples = path.stem.rpartition("-")
         found.append((view, int(samples), path))
     if not found:

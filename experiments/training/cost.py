@@ -18,16 +18,23 @@ from experiments.common.command import Options, main
 from experiments.common.report import Report
 from experiments.common.tables import table
 from experiments.common.timing import medians
-from jscomb.learning import networks
+from jscomb.learning import networks, recipes
 from jscomb.learning.recipes import RECIPES
 
+BASES = 6  # of the ensemble
 CHANNELS = 64  # of the convolution that sets the ceiling
 
+_OF_BASE = "base", "difference", "weight", "error"
 _INPUTS = {
     "njs": ("unbiased", "biased_a", "biased_b", "variance"),
     "dsc": ("prior", "unbiased", "biased", "variance", "mse"),
     "pd": ("unbiased", "biased", "variance", "sure"),
+    "neural-ensemble": (
+        *("unbiased", "variance", "albedo", "normal", "depth"),
+        *(f"{name}{k}" for k in range(BASES) for name in _OF_BASE),
+    ),
 }
+_CHANNELS = {"depth": 1, "weight": 1, "error": 2}  # of an input; others have three
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +93,7 @@ def inputs_of(method: str, size: int) -> dict[str, jax.Array]:
     """Return random inputs of a method.
 
     Args:
-        method: njs, dsc or pd.
+        method: njs, dsc, pd or neural-ensemble.
         size: width and height in pixels.
 
     Returns:
@@ -94,9 +101,10 @@ def inputs_of(method: str, size: int) -> dict[str, jax.Array]:
     """
     names = _INPUTS[method]
     keys = jax.random.split(jax.random.key(0), len(names))
-    one = {"variance", "mse"} if method == "dsc" else set()
+    channels = _CHANNELS | ({"variance": 1, "mse": 1} if method == "dsc" else {})
+    width = lambda name: channels.get(recipes.kind(name), 3)
     return {
-        name: jax.random.uniform(key, (size, size, 1 if name in one else 3))
+        name: jax.random.uniform(key, (size, size, width(name)))
         for key, name in zip(keys, names, strict=True)
     }
 
@@ -125,7 +133,8 @@ def run(config: Config) -> dict[str, Cost]:
             compiled = jax.jit(recipe.combine).lower(network, inputs).compile()
             used = compiled.memory_analysis().temp_size_in_bytes
             memory[name] = used / size**2
-            counts[name] = operations(network)
+            often = BASES if method == "neural-ensemble" else 1
+            counts[name] = often * operations(network)
             calls[name] = functools.partial(compiled, network, inputs)
     times = medians(calls, repeats)
     rate = counts["ceiling"] * size**2 / times["ceiling"]

@@ -211,7 +211,7 @@ def split_files(
         ...     print([file.stem for file in train], [file.stem for file in held])
         ['b-4', 'c-4'] ['a-4', 'a-8']
     """
-    listed = lambda folder: sorted(folder.glob("*.exr"))
+    listed = lambda folder: sorted(folder.glob("[!.]*.exr"))  # none half written
     if validation is None and (data / "train").is_dir():
         data, validation = data / "train", data / "validate"
     files = listed(data)
