@@ -141,7 +141,19 @@ def test_relative_l2_matches_its_equation(rng):
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
+def test_noise_to_noise_matches_its_equation(rng):
+    image, a, b = rng.random((3, 5, 6, 3)) * 3 - 0.5
+    wanted = 0
+    for i, j in np.ndindex(5, 6):
+        square = (image[i, j] - (a[i, j] + b[i, j]) / 2) ** 2
+        wanted += square.mean() / (image[i, j].mean() ** 2 + 0.01) / 30
+    halves = jnp.asarray(np.stack([a, b]))
+    found = losses.noise_to_noise(jnp.asarray(image), halves)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
 LOSSES = {
+    "noise to noise": (losses.noise_to_noise, True),
     "relative L2 of halves": (losses.relative_l2, True),
     "relative L2 of their mean": (recipes.of_mean(rel_l2), False),
     "log-L2": (recipes.of_mean(losses.log_l2), False),
@@ -155,7 +167,7 @@ def test_what_a_noisy_reference_does_to_a_loss(name, rng):
 
     The image is a multiple of the truth, and the loss that of the multiple: its minimum
     is at one. The weights of a noisy reference's own radiance, logarithms and absolute
-    values move it; halves that weight each other do not.
+    values move it; halves that weight each other do not, nor weights of the image.
     """
     loss, unbiased = LOSSES[name]
     truth = jnp.asarray(rng.random((6, 6, 3)))

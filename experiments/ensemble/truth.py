@@ -135,7 +135,7 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     """
     if config.quick:
         config = dataclasses.replace(
-            config, renderings=4, samples=4, size=24, reference_spp=32
+            config, renderings=12, samples=4, size=24, reference_spp=1024
         )
     return {scene: measure(config, scene) for scene in config.scenes}
 

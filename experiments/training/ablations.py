@@ -28,6 +28,7 @@ ABLATIONS: dict[str, recipes.Recipe] = {
     "njs-mean": _NJS._replace(loss=_MEAN),
     "dsc-smape": RECIPES["dsc"]._replace(loss=_SMAPE),
     "pd-mean": _PD._replace(loss=_MEAN),
+    "pd-halves": _PD._replace(loss=losses.relative_l2),
     "pd-log": _PD._replace(loss=_LOG),
     "pd-quotient": _QUOTIENT,
     "pd-smape": _QUOTIENT._replace(loss=_SMAPE),
@@ -37,5 +38,6 @@ ABLATIONS: dict[str, recipes.Recipe] = {
     ),
 }
 """njs-paper, dsc-smape and pd-smape are as in the papers; pd-quotient and pd-no-sure
-are of PD's table 4, whose third row, without the bound, needs no training; -mean has
-relative L2 with the mean of the reference's halves, which their noise biases."""
+are of PD's table 4, whose third row, without the bound, needs no training; -halves has
+relative L2 with each half of the reference weighted by the other; -mean with their
+mean, which its noise biases."""

@@ -25,8 +25,7 @@ class Config:
     """A run.
 
     Attributes:
-        run: what is trained: a method of `jscomb train`, or an ablation: njs-paper,
-            njs-log, dsc-smape, pd-quotient, pd-smape, pd-no-sure.
+        run: what is trained: a method of `jscomb train`, or one of `ablations`.
         data: folder of frames.
         out: folder of the run.
         quick: a short schedule of small crops of small frames.

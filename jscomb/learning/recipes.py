@@ -79,7 +79,7 @@ class Recipe(NamedTuple):
     network: Callable[..., Network]
     inputs: MakeInputs
     combine: Callable[..., Image]
-    loss: Callable[[Image, Halves], Scalar] = losses.relative_l2
+    loss: Callable[[Image, Halves], Scalar] = losses.noise_to_noise
     options: Mapping[str, Any] = types.MappingProxyType({})
     estimate: str = "oidn"
     without: Callable[[Inputs], Image] | None = None
