@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from jscomb import exr
+from jscomb.cli import with_bases
 from jscomb.denoisers import oidn
 from jscomb.learning import recipes
+from jscomb.learning.examples import combined
 from jscomb.learning.recipes import RECIPES
 from jscomb.metrics import rel_l2
 
@@ -40,9 +42,9 @@ def given(name):
         if recipe.estimate not in frame.estimates:
             continue
         estimate = frame.estimates[recipe.estimate]
-        inputs = recipe.inputs(jax.random.key(0), frame, estimate)
-        y = inputs.get("biased", inputs.get("biased_a"))  # pd denoises by itself
-        better = min(error(i, frame) for i in (frame.color, y))
+        seen = with_bases(recipe, frame)
+        inputs = recipe.inputs(jax.random.key(0), seen, estimate)
+        better = min(error(i, frame) for i in combined(inputs).values())
         found.append((frame, inputs, better))
     return found
 

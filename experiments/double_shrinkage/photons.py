@@ -31,7 +31,6 @@ COMBINERS = (
 ENSEMBLES = {
     "ensemble": (),
     "ensemble with James-Stein": ("whitened", "multi-scale"),
-    "ensemble with all": ("whitened", "multi-scale", "double-shrinkage", "dsc"),
 }
 
 

@@ -23,7 +23,7 @@ from jscomb import combine, exr
 from jscomb.methods import with_inputs
 
 DENOISERS = "oidn", "nfor", "bilateral", "rdfc", "nonlocal-means"
-COMBINERS = "james-stein", "whitened", "multi-scale", "njs", "double-shrinkage"
+COMBINERS = "james-stein", "whitened", "multi-scale", "njs"
 PATH_TRACING = "path-tracing"
 
 

@@ -22,6 +22,7 @@ from jscomb.typing import Image, Scalar
 
 __all__ = [
     "Judged",
+    "combined",
     "draw_losses",
     "make_inputs",
     "objective",
@@ -94,8 +95,7 @@ def make_inputs(
     makers = (recipe.inputs, *(recipe.others if variants else ()))
     made = [make(jax.random.key(0), frame, estimate) for make in makers]
     better = [
-        min(_error(image, halves) for image in _combined(each).values())
-        for each in made
+        min(_error(image, halves) for image in combined(each).values()) for each in made
     ]
     inputs = {name: np.stack([m[name] for m in made]) for name in made[0]}
     return inputs | {
@@ -256,8 +256,21 @@ def draw_losses(axes: Any, card: Mapping[str, Any], *, title: str) -> Any:
     return axes
 
 
-def _combined(inputs: Inputs) -> Inputs:
-    """The images that are combined, of what is known."""
+def combined(inputs: Inputs) -> Inputs:
+    """Return the images that a recipe combines, of its inputs.
+
+    Args:
+        inputs: of a recipe.
+
+    Returns:
+        those that are known, by name.
+
+    Example:
+        >>> one = jnp.ones((2, 2, 3))
+        >>> inputs = {"unbiased": one, "variance": one, "base0": jnp.nan * one}
+        >>> print(*combined(inputs))
+        unbiased
+    """
     return {
         name: image
         for name, image in inputs.items()
