@@ -142,13 +142,13 @@ def test_relative_l2_matches_its_equation(rng):
 
 
 def test_noise_to_noise_matches_its_equation(rng):
-    image, a, b = rng.random((3, 5, 6, 3)) * 3 - 0.5
+    image, guide, a, b = rng.random((4, 5, 6, 3)) * 3 - 0.5
     wanted = 0
     for i, j in np.ndindex(5, 6):
         square = (image[i, j] - (a[i, j] + b[i, j]) / 2) ** 2
-        wanted += square.mean() / (image[i, j].mean() ** 2 + 0.01) / 30
+        wanted += square.mean() / (guide[i, j].mean() ** 2 + 0.01) / 30
     halves = jnp.asarray(np.stack([a, b]))
-    found = losses.noise_to_noise(jnp.asarray(image), halves)
+    found = losses.noise_to_noise(*map(jnp.asarray, (image, halves, guide)))
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
@@ -171,7 +171,8 @@ def test_what_a_noisy_reference_does_to_a_loss(name, rng):
     """
     loss, unbiased = LOSSES[name]
     truth = jnp.asarray(rng.random((6, 6, 3)))
-    of_scale = lambda scale, halves: loss(scale * truth, halves)
+    more = () if loss in (losses.noise_to_noise, losses.relative_l2) else (None,)
+    of_scale = lambda scale, halves: loss(scale * truth, halves, *more)
     noise = jax.random.exponential(jax.random.key(0), (4000, 2, 6, 6, 3)) - 1
     noisy = lambda e: truth[None] + 0.7 * e
     slope = jax.jit(jax.vmap(lambda e: jax.grad(of_scale)(1.0, noisy(e))))

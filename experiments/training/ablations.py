@@ -16,6 +16,7 @@ def _no_sure(key, frame, estimate, *, make):
     return found | {"sure": jnp.square(x - y) - v}
 
 
+_HALVES = lambda image, halves, guide: losses.relative_l2(image, halves)
 _LOG = recipes.of_mean(losses.log_l2)
 _SMAPE = recipes.of_mean(metrics.smape)
 _MEAN = recipes.of_mean(metrics.rel_l2)
@@ -28,7 +29,7 @@ ABLATIONS: dict[str, recipes.Recipe] = {
     "njs-mean": _NJS._replace(loss=_MEAN),
     "dsc-smape": RECIPES["dsc"]._replace(loss=_SMAPE),
     "pd-mean": _PD._replace(loss=_MEAN),
-    "pd-halves": _PD._replace(loss=losses.relative_l2),
+    "pd-halves": _PD._replace(loss=_HALVES),
     "pd-log": _PD._replace(loss=_LOG),
     "pd-quotient": _QUOTIENT,
     "pd-smape": _QUOTIENT._replace(loss=_SMAPE),

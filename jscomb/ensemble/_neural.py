@@ -333,8 +333,8 @@ def neural_weights(
 
         f_k = 0.01 / (1 + |y_k - b|^2 / b^2 + |y_k - b|^2 / v),
 
-    and logits are at most 8, so with v the network's influence vanishes where the bases
-    differ: consistent if the multi-scale ensemble is.
+    and logits, less their mean, are at most 8, so with v the network's influence
+    vanishes where the bases differ: consistent if the multi-scale ensemble is.
 
     Args:
         network: as for `neural_combine`.
@@ -359,11 +359,18 @@ def neural_weights(
     noise = seen.variance + _NOISELESS * seen.square
     ratio = distance / seen.square[None] + distance / noise[None]
     prior = seen.weights + _LEAST / (1 + ratio)
-    logits = jnp.clip(network(seen), -_LARGEST_LOGIT, _LARGEST_LOGIT)
-    factors = jnp.where(seen.present, prior * jnp.exp(logits), 0.0)
+    factors = jnp.where(seen.present, prior * jnp.exp(_logits(network, seen)), 0.0)
     total = jnp.sum(factors, axis=0, keepdims=True)
     total = jnp.broadcast_to(total, factors.shape)
     return jnp.moveaxis(divide(factors, total, where=total > 0)[..., 0], 0, -1)
+
+
+def _logits(network: Network, seen: Candidates) -> Float[Array, "n h w 1"]:
+    """A network's logits, limited smoothly: what is clipped has no derivative."""
+    logits = network(seen)
+    present = seen.present.astype(logits.dtype)
+    mean = weighted_ratio(jnp.sum(present * logits, axis=0), jnp.sum(present, axis=0))
+    return _LARGEST_LOGIT * jnp.tanh((logits - mean[None]) / _LARGEST_LOGIT)
 
 
 def candidates(inputs: Mapping[str, Image]) -> Candidates:

@@ -182,7 +182,9 @@ def objective(
     def of_frame(network: Network, inputs: Any, halves: Array, unit: Scalar) -> Scalar:
         inputs = recipes.in_unit(inputs, unit)
         image = recipe.combine(network, inputs, **options)
-        return (loss or recipe.loss)(image, halves / unit)
+        if loss is not None:
+            return loss(image, halves / unit)
+        return recipe.loss(image, halves / unit, recipes.guide_of(inputs))
 
     return of_frame
 

@@ -17,18 +17,25 @@ __all__ = ["compress", "log_l2", "noise_to_noise", "relative_l2"]
 
 
 def noise_to_noise(
-    image: Image, halves: Float[Array, "2 h w c"], *, epsilon: float = 0.01
+    image: Image,
+    halves: Float[Array, "2 h w c"],
+    guide: Image | None = None,
+    *,
+    epsilon: float = 0.01,
 ) -> Scalar:
-    """Return the squared error relative to the image's own squared radiance.
+    """Return the squared error relative to the squared radiance of a guide.
 
-    The radiance in the denominator is held constant, so the reference's noise enters
-    the derivative linearly, and its mean is zero. Beside `relative_l2` that noise is
-    smaller: a reference's dark half beside a bright one has no large weight.
+    The guide is held constant and knows nothing of the reference, so the reference's
+    noise enters the derivative linearly, and its mean is zero. Beside `relative_l2`
+    that noise is smaller: a reference's dark half has no large weight beside a bright
+    one. With a guide without fireflies those of the image have their full weight.
 
     Args:
         image: normalised radiance, shape [H,W,C].
         halves: of the reference, independent of the image.
-        epsilon: added to the squared mean of the image's channels.
+        guide: normalised radiance, independent of the reference, same shape as the
+            image, such as a denoised image; None for the image itself.
+        epsilon: added to the squared mean of the guide's channels.
 
     Returns:
         the mean over pixels and channels.
@@ -42,10 +49,11 @@ def noise_to_noise(
         0.444
 
     Source: J. Lehtinen et al., "Noise2Noise: learning image restoration without clean
-    data", 2018, section 3.2 (for radiance).
+    data", 2018, section 3.2 (for radiance); the guide is ours.
     """
-    check_same_shape(image=image, half=halves[0])
-    radiance = lax.stop_gradient(jnp.mean(image, axis=-1, keepdims=True))
+    guide = image if guide is None else guide
+    check_same_shape(image=image, half=halves[0], guide=guide)
+    radiance = lax.stop_gradient(jnp.mean(guide, axis=-1, keepdims=True))
     square = jnp.square(image - jnp.mean(halves, axis=0))
     return jnp.mean(square / (jnp.square(radiance) + epsilon))
 
