@@ -28,6 +28,9 @@ ABLATIONS: dict[str, recipes.Recipe] = {
     "njs-log": _NJS._replace(loss=_LOG),
     "njs-mean": _NJS._replace(loss=_MEAN),
     "dsc-smape": RECIPES["dsc"]._replace(loss=_SMAPE),
+    "neural-ensemble-noise-to-noise": RECIPES["neural-ensemble"]._replace(
+        loss=losses.noise_to_noise
+    ),
     "pd-mean": _PD._replace(loss=_MEAN),
     "pd-halves": _PD._replace(loss=_HALVES),
     "pd-log": _PD._replace(loss=_LOG),

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb import double_shrinkage, ensemble, james_stein, progressive
+from jscomb import double_shrinkage, ensemble, james_stein, metrics, progressive
 from jscomb.denoisers import bilateral, kernel_predicting, oidn
 from jscomb.features import FEATURES, stack
 from jscomb.frame import Estimate, Frame
@@ -340,6 +340,7 @@ RECIPES = {
         networks.EnsembleNetwork,
         _ensemble,
         ensemble.combine_inputs,
+        of_mean(metrics.rel_l2),
         without=_ensemble_without,
         bases=BASES,
         others=(
@@ -356,7 +357,9 @@ RECIPES = {
 }
 """Recipes by name. The last two learn a denoiser, alone and jointly with a combiner.
 Unlike the papers njs has the whitened rule, pd has alpha as one output of the network,
-and the loss is one that noisy references do not bias."""
+and the loss is one that noisy references do not bias; but for the ensemble, whose
+network those losses make worse than none: their gradients are mostly of the few pixels
+whose energy a reference of few samples hardly knows."""
 
 
 def shipped(name: str) -> Network:

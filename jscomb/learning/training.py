@@ -46,9 +46,13 @@ class Schedule:
     seed: int = 0
 
     def optimiser(self) -> optax.GradientTransformation:
-        """Return Adam with clipped gradients, because of fireflies."""
+        """Return Adam with gradients of norm one.
+
+        Norms differ by four decades from batch to batch, because of fireflies: a large
+        one would hold Adam still for hundreds of steps.
+        """
         rate = optax.cosine_onecycle_schedule(self.steps, self.rate)
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+        return optax.chain(optax.normalize_by_update_norm(), optax.adam(rate))
 
 
 class Examples(NamedTuple):

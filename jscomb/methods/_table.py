@@ -179,14 +179,6 @@ METHODS: dict[str, Method] = {
         "estimates",
         make=lambda key, frame, bases: ensemble.combine_frame(frame, bases),
     ),
-    "neural-ensemble": Method(
-        "`ensemble` with weights that a trained network corrects at each pixel",
-        ensemble.NEURAL_NEEDS,
-        "estimates",
-        make=lambda key, frame, bases: ensemble.neural_combine_frame(
-            _network("neural-ensemble"), frame, bases
-        ),
-    ),
 }
 """By name; the cheaper first among the combiners. Uncorrelated kernels are not here:
 they combine two renderings (`uncorrelated.combine_frame`)."""
