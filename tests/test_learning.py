@@ -141,19 +141,7 @@ def test_relative_l2_matches_its_equation(rng):
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
-def test_noise_to_noise_matches_its_equation(rng):
-    image, guide, a, b = rng.random((4, 5, 6, 3)) * 3 - 0.5
-    wanted = 0
-    for i, j in np.ndindex(5, 6):
-        square = (image[i, j] - (a[i, j] + b[i, j]) / 2) ** 2
-        wanted += square.mean() / (guide[i, j].mean() ** 2 + 0.01) / 30
-    halves = jnp.asarray(np.stack([a, b]))
-    found = losses.noise_to_noise(*map(jnp.asarray, (image, halves, guide)))
-    np.testing.assert_allclose(found, wanted, rtol=1e-12)
-
-
 LOSSES = {
-    "noise to noise": (losses.noise_to_noise, True),
     "relative L2 of halves": (losses.relative_l2, True),
     "relative L2 of their mean": (recipes.of_mean(rel_l2), False),
     "log-L2": (recipes.of_mean(losses.log_l2), False),
@@ -167,12 +155,11 @@ def test_what_a_noisy_reference_does_to_a_loss(name, rng):
 
     The image is a multiple of the truth, and the loss that of the multiple: its minimum
     is at one. The weights of a noisy reference's own radiance, logarithms and absolute
-    values move it; halves that weight each other do not, nor weights of the image.
+    values move it; halves that weight each other do not.
     """
     loss, unbiased = LOSSES[name]
     truth = jnp.asarray(rng.random((6, 6, 3)))
-    more = () if loss in (losses.noise_to_noise, losses.relative_l2) else (None,)
-    of_scale = lambda scale, halves: loss(scale * truth, halves, *more)
+    of_scale = lambda scale, halves: loss(scale * truth, halves)
     noise = jax.random.exponential(jax.random.key(0), (4000, 2, 6, 6, 3)) - 1
     noisy = lambda e: truth[None] + 0.7 * e
     slope = jax.jit(jax.vmap(lambda e: jax.grad(of_scale)(1.0, noisy(e))))

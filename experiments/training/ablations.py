@@ -16,7 +16,6 @@ def _no_sure(key, frame, estimate, *, make):
     return found | {"sure": jnp.square(x - y) - v}
 
 
-_HALVES = lambda image, halves, guide: losses.relative_l2(image, halves)
 _LOG = recipes.of_mean(losses.log_l2)
 _SMAPE = recipes.of_mean(metrics.smape)
 _MEAN = recipes.of_mean(metrics.rel_l2)
@@ -28,11 +27,10 @@ ABLATIONS: dict[str, recipes.Recipe] = {
     "njs-log": _NJS._replace(loss=_LOG),
     "njs-mean": _NJS._replace(loss=_MEAN),
     "dsc-smape": RECIPES["dsc"]._replace(loss=_SMAPE),
-    "neural-ensemble-noise-to-noise": RECIPES["neural-ensemble"]._replace(
-        loss=losses.noise_to_noise
+    "neural-ensemble-halves": RECIPES["neural-ensemble"]._replace(
+        loss=losses.relative_l2
     ),
     "pd-mean": _PD._replace(loss=_MEAN),
-    "pd-halves": _PD._replace(loss=_HALVES),
     "pd-log": _PD._replace(loss=_LOG),
     "pd-quotient": _QUOTIENT,
     "pd-smape": _QUOTIENT._replace(loss=_SMAPE),
@@ -42,6 +40,6 @@ ABLATIONS: dict[str, recipes.Recipe] = {
     ),
 }
 """njs-paper, dsc-smape and pd-smape are as in the papers; pd-quotient and pd-no-sure
-are of PD's table 4, whose third row, without the bound, needs no training; -halves has
-relative L2 with each half of the reference weighted by the other; -mean with their
-mean, which its noise biases."""
+are of PD's table 4, whose third row, without the bound, needs no training; -mean has
+relative L2 with the mean of the reference's halves, which their noise biases, -halves
+with each half weighted by the other."""

@@ -182,9 +182,7 @@ def objective(
     def of_frame(network: Network, inputs: Any, halves: Array, unit: Scalar) -> Scalar:
         inputs = recipes.in_unit(inputs, unit)
         image = recipe.combine(network, inputs, **options)
-        if loss is not None:
-            return loss(image, halves / unit)
-        return recipe.loss(image, halves / unit, recipes.guide_of(inputs))
+        return (loss or recipe.loss)(image, halves / unit)
 
     return of_frame
 

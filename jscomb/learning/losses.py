@@ -1,61 +1,17 @@
 """Losses that networks are trained on; `metrics.smape` is another.
 
 Images [H,W,C], linear radiance, normalised. A reference is as noisy as its samples are
-few. `noise_to_noise` and `relative_l2` take its halves, and their derivatives have the
-expectation of those with the truth, however noisy they are; those of `log_l2` and
-`metrics.smape` do not.
+few. `relative_l2` takes its halves, and its derivative has the expectation of that with
+the truth, however noisy they are; those of `log_l2` and `metrics.smape` do not.
 """
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape
 from jscomb.typing import Image, Scalar
 
-__all__ = ["compress", "log_l2", "noise_to_noise", "relative_l2"]
-
-
-def noise_to_noise(
-    image: Image,
-    halves: Float[Array, "2 h w c"],
-    guide: Image | None = None,
-    *,
-    epsilon: float = 0.01,
-) -> Scalar:
-    """Return the squared error relative to the squared radiance of a guide.
-
-    The guide is held constant and knows nothing of the reference, so the reference's
-    noise enters the derivative linearly, and its mean is zero. Beside `relative_l2`
-    that noise is smaller: a reference's dark half has no large weight beside a bright
-    one. With a guide without fireflies those of the image have their full weight.
-
-    Args:
-        image: normalised radiance, shape [H,W,C].
-        halves: of the reference, independent of the image.
-        guide: normalised radiance, independent of the reference, same shape as the
-            image, such as a denoised image; None for the image itself.
-        epsilon: added to the squared mean of the guide's channels.
-
-    Returns:
-        the mean over pixels and channels.
-
-    Raises:
-        ValueError: while tracing, if shapes differ.
-
-    Example:
-        >>> one = jnp.ones((2, 2, 2, 3))
-        >>> print(f"{noise_to_noise(3 * one[0], one):.3f}")
-        0.444
-
-    Source: J. Lehtinen et al., "Noise2Noise: learning image restoration without clean
-    data", 2018, section 3.2 (for radiance); the guide is ours.
-    """
-    guide = image if guide is None else guide
-    check_same_shape(image=image, half=halves[0], guide=guide)
-    radiance = lax.stop_gradient(jnp.mean(guide, axis=-1, keepdims=True))
-    square = jnp.square(image - jnp.mean(halves, axis=0))
-    return jnp.mean(square / (jnp.square(radiance) + epsilon))
+__all__ = ["compress", "log_l2", "relative_l2"]
 
 
 def relative_l2(

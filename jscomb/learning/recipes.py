@@ -32,7 +32,6 @@ __all__ = [
     "WEIGHTS",
     "Recipe",
     "exchanged",
-    "guide_of",
     "in_unit",
     "kind",
     "load_network",
@@ -46,7 +45,7 @@ Network = Any  # a pytree of parameters that can be called
 Inputs = dict[str, Image]
 MakeInputs = Callable[[Key, Frame, Estimate], Inputs]
 Halves = Float[Array, "2 h w c"]
-Loss = Callable[[Image, Halves, Image | None], Scalar]
+Loss = Callable[[Image, Halves], Scalar]
 
 WEIGHTS = pathlib.Path(str(importlib.resources.files("jscomb.learning"))) / "weights"
 """Folder of the parameters that come with the package, and of their cards."""
@@ -69,8 +68,7 @@ class Recipe(NamedTuple):
         network: its class, to be called with a key, a size and `options`.
         inputs: from a key, a normalised frame and an estimate to images by name.
         combine: from a network and its inputs to a normalised image.
-        loss: of an image, the halves of a reference, and a guide or None, see
-            `guide_of`; all normalised.
+        loss: of an image and the halves of a reference, all normalised.
         options: of the network: what it is for, in words that a card can hold.
         estimate: name of the frame's estimate that it combines.
         without: the estimator without a network, from the same inputs.
@@ -82,7 +80,7 @@ class Recipe(NamedTuple):
     network: Callable[..., Network]
     inputs: MakeInputs
     combine: Callable[..., Image]
-    loss: Loss = losses.noise_to_noise
+    loss: Loss = losses.relative_l2
     options: Mapping[str, Any] = types.MappingProxyType({})
     estimate: str = "oidn"
     without: Callable[[Inputs], Image] | None = None
@@ -106,41 +104,10 @@ def of_mean(loss: Callable[[Image, Image], Scalar]) -> Loss:
 
     Example:
         >>> halves = jnp.stack([jnp.zeros((1, 1, 3)), jnp.ones((1, 1, 3))])
-        >>> print(f"{of_mean(losses.log_l2)(halves[0], halves, None):.3f}")
+        >>> print(f"{of_mean(losses.log_l2)(halves[0], halves):.3f}")
         0.943
     """
-    return lambda image, halves, guide: loss(image, jnp.mean(halves, axis=0))
-
-
-def guide_of(inputs: Mapping[str, Image]) -> Image | None:
-    """Return an image without fireflies, of a recipe's inputs.
-
-    Args:
-        inputs: of a recipe.
-
-    Returns:
-        the biased image; of bases the one of median luminance at each pixel, the darker
-        of two; None if there is neither.
-
-    Example:
-        >>> bases = {f"base{k}": jnp.full((1, 1, 3), k + 2.0) for k in range(4)}
-        >>> print(guide_of(bases)[0, 0])
-        [3. 3. 3.]
-    """
-    for name in ("biased", "biased_a"):
-        if name in inputs:
-            return inputs[name]
-    bases = [image for name, image in inputs.items() if kind(name) == "base"]
-    if not bases:
-        return None
-    stack = jnp.stack(bases)
-    luminance = jnp.mean(stack, axis=-1)
-    known = jnp.isfinite(luminance)
-    order = jnp.argsort(jnp.where(known, luminance, jnp.inf), axis=0)
-    middle = (jnp.sum(known, axis=0, keepdims=True) - 1) // 2
-    which = jnp.take_along_axis(order, jnp.maximum(middle, 0), axis=0)
-    found = jnp.take_along_axis(stack, which[..., None], axis=0)[0]
-    return jnp.where(jnp.isfinite(found), found, 0.0)
+    return lambda image, halves: loss(image, jnp.mean(halves, axis=0))
 
 
 def exchanged(inputs: MakeInputs) -> MakeInputs:
@@ -245,8 +212,7 @@ def _ensemble(
     found = ensemble.neural_inputs(frame, {n: frame.estimates[n] for n in bases})
     for number in range(len(bases), len(BASES)):
         for name in [n for n in found if n.endswith("0")]:
-            unknown = jnp.full_like(found[name], jnp.nan)
-            found[f"{kind(name)}{number}"] = unknown
+            found[f"{kind(name)}{number}"] = jnp.full_like(found[name], jnp.nan)
     if features:
         return found
     return found | {n: jnp.zeros_like(found[n]) for n in FEATURES if n in found}
@@ -357,9 +323,8 @@ RECIPES = {
 }
 """Recipes by name. The last two learn a denoiser, alone and jointly with a combiner.
 Unlike the papers njs has the whitened rule, pd has alpha as one output of the network,
-and the loss is one that noisy references do not bias; but for the ensemble, whose
-network those losses make worse than none: their gradients are mostly of the few pixels
-whose energy a reference of few samples hardly knows."""
+and the loss is one that noisy references do not bias; but for the ensemble, which is
+trained on the error that it is judged by."""
 
 
 def shipped(name: str) -> Network:

@@ -171,6 +171,7 @@ def with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
         ValueError: if the frame lacks what a method needs.
 
     Example:
+        >>> import jax
         >>> from jscomb.frame import make_frame
         >>> frame = make_frame(jnp.ones((2, 4, 4, 3))).normalised()
         >>> print(*with_inputs(jax.random.key(0), frame, ["path-tracing"]).estimates)

@@ -111,7 +111,7 @@ def test_bad_configurations_of_a_dataset(tmp_path):
 def test_a_dataset_is_made_once(tmp_path, vectorised, capsys):
     config = dataset.Config(tmp_path, scenes=tmp_path, splits=("train",), quick=True)
     files = dataset.run(config)
-    assert "3 frames made" in capsys.readouterr().out
+    assert "7 frames made" in capsys.readouterr().out
     frames = [exr.read_frame(file) for file in files]
     for frame in frames:
         np.testing.assert_array_equal(frame.reference.image, frames[0].reference.image)

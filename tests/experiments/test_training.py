@@ -109,7 +109,7 @@ def test_quick_training_lowers_the_error_of_a_held_out_piece(method, crops, tmp_
     subprocess.run([*command, *options], env=optimised, cwd=ROOT, check=True)
     card = json.loads((config.out / "network.json").read_text())
     best, untrained = (card["validation"][kind] for kind in ("best", "untrained"))
-    assert best["all"] < 0.7 * untrained["all"]
+    assert best["all"] < 0.75 * untrained["all"]
     assert (card["train"]["frames"], card["validate"]["frames"]) == (6, 2)
     assert (tmp_path / "run" / "losses.png").stat().st_size > 1000
     # The stored network is the one that the card describes.
