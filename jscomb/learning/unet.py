@@ -90,8 +90,8 @@ class Headed(nnx.Module):
     Example:
         >>> class Grey(Headed):
         ...     def __init__(self, key):
-        ...         self.body = UNet(key, 3, size="light")
-        ...         self.head = Convolution(key, 16, 1)
+        ...         self.body = UNet(jax.random.clone(key), 3, size="light")
+        ...         self.head = Convolution(jax.random.clone(key), 16, 1)
         >>> print(Grey(jax.random.key(0)).reach)
         24
     """
