@@ -229,7 +229,7 @@ def bases_of(rng, count, size=(12, 8)):
 
 
 def test_an_ensembles_order_does_not_matter(rng):
-    network, inputs = waking(networks.EnsembleNetwork(key(), size="light")), {}
+    network = waking(networks.EnsembleNetwork(key(), size="light"))
     inputs = bases_of(rng, 3)
     turned = dict(inputs)
     for name, image in inputs.items():

@@ -18,6 +18,7 @@ from jscomb.denoisers import oidn
 from jscomb.learning import recipes
 from jscomb.learning.examples import combined
 from jscomb.learning.recipes import RECIPES
+from jscomb.methods import TIERS
 from jscomb.metrics import rel_l2
 
 FRAMES = sorted(pathlib.Path(__file__).parent.glob("data/*.exr"))
@@ -94,6 +95,10 @@ def kept(values, untrained, plain):
         WORST: values.max() <= 1.05,
     }
     return {promise for promise, holds in held.items() if holds}
+
+
+def test_an_ensembles_network_is_trained_on_what_a_tier_is_made_of():
+    assert set(recipes.BASES) == set(TIERS["balanced"].bases)
 
 
 def test_the_frames_are_of_several_scenes_and_counts():

@@ -266,9 +266,8 @@ def prepare(
         kept = cache / f"{file.stem}.npz"
         if not kept.exists():
             frame = exr.read_frame(file)
-            if recipe.bases:
-                frame = with_bases(recipe, frame)
             try:
+                frame = with_bases(recipe, frame)
                 made: Any = examples.make_inputs(recipe, frame, variants=variants)
             except ValueError as error:
                 raise ValueError(f"{file}: {error}") from None

@@ -25,11 +25,11 @@ are local, with few there is almost one weight a base for the frame. A pixel who
 buffer is noisy has less weight in these means; weights vary slowly, so they are solved
 for in blocks of 4x4 pixels and interpolated.
 
+Consistent if one base is: its error vanishes as samples grow, and so does the minimum.
+
 A network can correct these weights pixel by pixel (`neural_combine`): it sees the
 bases, x, its variance, the features and the error matrix, and gives each base a factor.
 Bases are alike to it: any number, in any order.
-
-Consistent if one base is: its error vanishes as samples grow, and so does the minimum.
 
 Weights learn from both halves. So the halves of an ensemble are independent only where
 each half has halves of its own (four sub-buffers, and bases that can be made from a

@@ -333,8 +333,9 @@ def neural_weights(
 
         f_k = 0.01 / (1 + |y_k - b|^2 / b^2 + |y_k - b|^2 / v),
 
-    and logits, less their mean, are at most 8, so with v the network's influence
-    vanishes where the bases differ: consistent if the multi-scale ensemble is.
+    and logits, less their mean, are at most 8. So where the multi-scale weights settle
+    on one base, the network's influence vanishes with v; where they share out among
+    bases that differ it does not, and with it their consistency may be lost.
 
     Args:
         network: as for `neural_combine`.

@@ -48,8 +48,8 @@ class Schedule:
     def optimiser(self) -> optax.GradientTransformation:
         """Return Adam with gradients of norm one.
 
-        Norms differ by four decades from batch to batch, because of fireflies: a large
-        one would hold Adam still for hundreds of steps.
+        Fireflies make norms differ from batch to batch, by four decades as the
+        ensemble's network begins; Adam would remember the largest for long.
         """
         rate = optax.cosine_onecycle_schedule(self.steps, self.rate)
         return optax.chain(optax.normalize_by_update_norm(), optax.adam(rate))
