@@ -18,7 +18,7 @@ import dataclasses
 import functools
 import pathlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +28,7 @@ from tqdm import tqdm
 
 from experiments.common.command import tool
 from experiments.common.processes import in_fresh_processes
+from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.data import variations
 from experiments.data.development import noise
@@ -200,6 +201,38 @@ def frames(folder: pathlib.Path, split: str) -> Iterator[tuple[str, int, pathlib
     if not found:
         raise ValueError(f"{folder / split}: no frames there; experiments.data.dataset")
     yield from sorted(found)
+
+
+def measured(
+    folder: pathlib.Path,
+    split: str,
+    measure: Callable[[pathlib.Path], Any],
+    results: pathlib.Path | None,
+    *,
+    first: int | None = None,
+) -> dict[str, Any]:
+    """Measure the frames of a split, and keep what was measured as it comes.
+
+    Args:
+        folder: that `run` wrote.
+        split: train, validate or test.
+        measure: of a frame's file.
+        results: file that stores results; None to keep none.
+        first: how many frames; None for all.
+
+    Returns:
+        what was measured, by "view samples".
+
+    Raises:
+        ValueError: if there are no frames.
+    """
+    store = Results(results)
+    return {
+        f"{view} {samples}": store.get(
+            f"{view} {samples}", functools.partial(measure, path)
+        )
+        for view, samples, path in list(frames(folder, split))[:first]
+    }
 
 
 def run(config: Config) -> list[pathlib.Path]:

@@ -6,7 +6,6 @@ the better of both images. Ensembles are of both images, and of what follows the
 """
 
 import dataclasses
-import functools
 import pathlib
 
 import jax
@@ -15,7 +14,6 @@ import tyro
 from experiments.common import errors
 from experiments.common.command import Options, main
 from experiments.common.report import Report
-from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.data import dataset
 from jscomb import combine, exr
@@ -101,14 +99,9 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: if there are no frames.
     """
-    store = Results(config.results)
-    files = list(dataset.frames(config.folder, config.split))
-    found = {
-        f"{view} {samples}": store.get(
-            f"{view} {samples}", functools.partial(measure, path)
-        )
-        for view, samples, path in (files[:1] if config.quick else files)
-    }
+    first = 1 if config.quick else None
+    where = config.folder, config.split
+    found = dataset.measured(*where, measure, config.results, first=first)
     return {key: row for key, row in found.items() if row}
 
 
@@ -123,14 +116,14 @@ def report(found: dict[str, dict[str, float]]) -> Report:
     """
     names = list(next(iter(found.values())))
     better = lambda row: min(row[PATH_TRACING], row[PHOTONS])
-    mean = {
-        name: errors.geometric_mean(row[name] / better(row) for row in found.values())
-        for name in names[2:]
-    }
-    said = ", ".join(f"{name} {value:.3f}" for name, value in mean.items())
+    ratios = {n: [row[n] / better(row) for row in found.values()] for n in names[2:]}
+    said = ", ".join(
+        f"{name} {errors.geometric_mean(some):.3f} ({max(some):.2f})"
+        for name, some in ratios.items()
+    )
     answer = (
         "Relative L2 over the better of path tracing and photon mapping, geometric "
-        f"mean of {len(found)} frames: {said}."
+        f"mean (worst) of {len(found)} frames: {said}."
     )
     first = errors.means(found, names, better, title="image")
     every = table(["frame", *names], [[k, *row.values()] for k, row in found.items()])

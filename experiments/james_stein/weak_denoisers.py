@@ -7,7 +7,6 @@ over that of the image alone.
 """
 
 import dataclasses
-import functools
 import pathlib
 
 import jax
@@ -16,7 +15,6 @@ import tyro
 from experiments.common import errors
 from experiments.common.command import Options, main
 from experiments.common.report import Report
-from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.data import dataset
 from jscomb import combine, exr
@@ -79,14 +77,9 @@ def run(config: Config) -> dict[str, dict[str, dict[str, float]]]:
         ValueError: if there are no frames.
         ImportError: if Open Image Denoise is missing.
     """
-    store = Results(config.results)
-    files = list(dataset.frames(config.folder, config.split))
-    return {
-        f"{view} {samples}": store.get(
-            f"{view} {samples}", functools.partial(measure, path)
-        )
-        for view, samples, path in (files[:1] if config.quick else files)
-    }
+    first = 1 if config.quick else None
+    where = config.folder, config.split
+    return dataset.measured(*where, measure, config.results, first=first)
 
 
 def report(found: dict[str, dict[str, dict[str, float]]]) -> Report:
@@ -109,7 +102,9 @@ def report(found: dict[str, dict[str, dict[str, float]]]) -> Report:
             for group in groups.values()
         ]
         each = ", ".join(f"{ratio:.2f}" for ratio in ratios)
-        said.append(f"{name} {each} at {', '.join(map(str, groups))} samples")
+        worst = max(r["multi-scale"] / _alone(r) for r in rows.values())
+        counts = ", ".join(map(str, groups))
+        said.append(f"{name} {each} at {counts} samples (worst {worst:.2f})")
     answer = (
         "Relative L2 of `multi-scale` over that of the denoised image alone, geometric "
         f"mean of frames: {'; '.join(said)}."

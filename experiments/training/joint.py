@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from experiments.common import errors
 from experiments.common.command import Options, main
 from experiments.common.report import Report
-from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.data import dataset
 from experiments.training.learned import curves
@@ -159,14 +158,12 @@ def run(config: Config) -> Found:
     Raises:
         ValueError: if there are no frames, or a folder holds another run.
     """
-    trained, store = train(config), Results(config.results)
-    files = list(dataset.frames(config.folder, config.split))
-    rows = {
-        f"{view} {samples}": store.get(
-            f"{view} {samples}", functools.partial(measure, path, trained)
-        )
-        for view, samples, path in (files[:2] if config.quick else files)
-    }
+    trained, first = train(config), 2 if config.quick else None
+    of, where = (
+        functools.partial(measure, trained=trained),
+        (config.folder, config.split),
+    )
+    rows = dataset.measured(*where, of, config.results, first=first)
     return Found(rows, {name: card for name, (*_, card) in trained.items()})
 
 

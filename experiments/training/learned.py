@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 from experiments.common import errors
 from experiments.common.command import Options, main
 from experiments.common.report import Report
-from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.data import dataset
 from experiments.training.train import ALL
@@ -153,12 +152,9 @@ def run(config: Config) -> Found:
         ValueError: if there are no frames.
     """
     trained = networks_of(config.runs)
-    store = Results(config.results)
-    rows: dict[str, dict[str, float]] = {}
-    files = list(dataset.frames(config.folder, config.split))
-    for view, samples, path in files[:2] if config.quick else files:
-        key = f"{view} {samples}"
-        rows[key] = store.get(key, functools.partial(measure, path, trained))
+    of, first = functools.partial(measure, trained=trained), 2 if config.quick else None
+    where = config.folder, config.split
+    rows = dataset.measured(*where, of, config.results, first=first)
     combines = {name: ALL[each.method].estimate for name, each in trained.items()}
     where = recipes.WEIGHTS if config.runs is None else config.runs
     file = "{}.safetensors" if config.runs is None else "{}/network.safetensors"
