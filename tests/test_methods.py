@@ -18,7 +18,7 @@ key = lambda: jax.random.key(0)
 needs_oidn = pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 
 
-def slow_ones(names, slow=("ensemble", "nfor")):
+def slow_ones(names, slow=("ensemble", "neural-ensemble", "nfor")):
     """The names, those of methods that take long to compile marked."""
     marks = {name: [pytest.mark.slow] for name in slow}
     return [pytest.param(name, marks=marks.get(name, [])) for name in names]

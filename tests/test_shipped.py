@@ -28,6 +28,7 @@ KEPT = {
     "pd": {UNTRAINED, WITHOUT, WORST},
     "dsc": {UNTRAINED},
     "dsc-photons": {UNTRAINED, WITHOUT, WORST},
+    "neural-ensemble": {WITHOUT, WORST},
 }
 SEEDS = (0, 1, 2)
 

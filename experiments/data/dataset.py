@@ -80,7 +80,7 @@ SPLITS = {
         random=6,
         first=2000,
         reference_spp=2048,
-        counts=(8, 32, 128, 512),
+        counts=(4, 8, 32, 128, 512),
     ),
     "test": Split(
         ("living-room", "staircase2", "veach-bidir"),
@@ -320,12 +320,10 @@ def _render(config: Config, view: View) -> int:
     if scene is None:
         blind.touch()
         return 0
-    first = next(iter(files.values()))
-    for number, (spp, path) in enumerate(files.items()):
-        if path.exists():
-            continue
-        settings = _settings(config, view, number, spp)
-        shared = None if path == first else exr.read_frame(first)
+    done = [path for path in files.values() if path.exists()]
+    for spp, path in todo.items():
+        settings = _settings(config, view, spp, first=not done)
+        shared = exr.read_frame(done[0]) if done else None
         partial = path.with_suffix(".partial.npz")
         frame = rendering.render(
             scene,
@@ -340,6 +338,7 @@ def _render(config: Config, view: View) -> int:
         about = rendering.provenance(scene, settings)
         exr.write_frame(path, frame, provenance=about)
         partial.unlink(missing_ok=True)
+        done.append(path)
     return len(todo)
 
 
@@ -360,10 +359,11 @@ def _source(config: Config, view: View) -> str | None:
     return str(path)
 
 
-def _settings(config: Config, view: View, number: int, spp: int) -> Settings:
+def _settings(config: Config, view: View, spp: int, *, first: bool) -> Settings:
     """What is rendered: the first frame brings the reference and the photons."""
     more: dict[str, Any] = {}
-    if number == 0:
+    seed = spp.bit_length() * STREAMS  # sample counts are powers of two
+    if first:
         rng = np.random.default_rng([_number(view), 0xF0705])
         more = {
             "reference_spp": SPLITS[view.split].reference_spp,
@@ -374,7 +374,7 @@ def _settings(config: Config, view: View, number: int, spp: int) -> Settings:
     if config.quick:
         size, spp = 16, 8
         more = {"reference_spp": 64, "photons": 1000, "passes": 4} if more else {}
-    return Settings(spp=spp, size=size, buffers=BUFFERS, seed=number * STREAMS, **more)
+    return Settings(spp=spp, size=size, buffers=BUFFERS, seed=seed, **more)
 
 
 if __name__ == "__main__":

@@ -201,7 +201,7 @@ def _made_of(frame: Frame, name: str | None, method: str) -> list[str]:
     """The names of the estimates that a method combines."""
     chosen = methods.METHODS[method]
     if chosen.takes == "estimates":
-        return list(methods.inputs(frame.normalised(), biased=name)[0])
+        return list(methods.inputs(frame.normalised(), biased=name, method=method)[0])
     if chosen.takes == "nothing":
         return [chosen.denoiser] if chosen.denoiser else []
     return [methods.input_name(frame, biased=name)]

@@ -31,7 +31,7 @@ NEURAL_NEEDS = NEEDS._replace(variance=True, channels=3, normalised=True)
 
 _BLOCK = 4
 _LEAST = 0.01  # weight of a base like the blend, however small its own
-_LARGEST_LOGIT = 8.0
+_LARGEST_LOGIT = 2.0
 _DARK = 0.01  # added to squared normalised radiance
 _NOISELESS = 1e-6  # of the squared radiance: less variance is not trusted
 _KINDS = "base", "difference", "weight", "error"
@@ -333,7 +333,7 @@ def neural_weights(
 
         f_k = 0.01 / (1 + |y_k - b|^2 / b^2 + |y_k - b|^2 / v),
 
-    and logits, less their mean, are at most 8. So where the multi-scale weights settle
+    and logits, less their mean, are at most 2. So where the multi-scale weights settle
     on one base, the network's influence vanishes with v; where they share out among
     bases that differ it does not, and with it their consistency may be lost.
 

@@ -33,7 +33,7 @@ def combine(
         biased: the biased image to combine with: an estimate of the frame, or a
             denoiser of `METHODS`; several for an ensemble. None for the frame's only
             estimate, or Open Image Denoise if it has none; for an ensemble all of them
-            and `BASES`.
+            and the method's `bases`.
         budget: seconds that a tier may take, without compilation; None for any.
 
     Returns:

@@ -7,21 +7,25 @@ import jax.numpy as jnp
 
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame, Maker
-from jscomb.methods._table import BASES, METHODS
+from jscomb.methods._table import METHODS
 from jscomb.typing import Key
 
 _DENOISER = "oidn"  # for frames without an estimate
 
 
 def inputs(
-    frame: Frame, *, biased: str | Sequence[str] | None = None
+    frame: Frame,
+    *,
+    biased: str | Sequence[str] | None = None,
+    method: str = "ensemble",
 ) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return which bases an ensemble of a frame has, and why others are skipped.
 
     Args:
         frame: the frame.
         biased: names of estimates and denoisers; None for all of the frame's estimates
-            and `BASES`.
+            and the `bases` of the method.
+        method: that takes several estimates.
 
     Returns:
         the names, and the reasons by name.
@@ -37,9 +41,10 @@ def inputs(
     """
     if isinstance(biased, str):
         biased = [biased]
-    wanted = [*frame.estimates, *BASES] if biased is None else list(biased)
+    if biased is None:
+        biased = [*frame.estimates, *METHODS[method].bases]
     names, skipped = [], {}
-    for name in dict.fromkeys(wanted):
+    for name in dict.fromkeys(biased):
         if name in frame.estimates:
             has = frame.estimates[name].halves is not None
             reason = "" if has or can_make(name, frame) else "it has no halves"
@@ -77,7 +82,7 @@ def given_to(
             raise ValueError(f"{method} takes no biased image, got {biased!r}")
         return frame, ()
     if chosen.takes == "estimates":
-        names, skipped = inputs(frame, biased=biased)
+        names, skipped = inputs(frame, biased=biased, method=method)
         if not names:
             raise ValueError(f"{method} has no bases: {_listed(skipped)}")
         frame = with_inputs(key, frame, names)

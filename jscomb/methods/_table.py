@@ -28,6 +28,7 @@ class Method(NamedTuple):
         denoiser: the denoiser that it runs by itself, where it takes no estimate.
         pure: decides on no values, for `jit` and `vmap`.
         variant: of Open Image Denoise; those of one frame are made together.
+        bases: what it is made of beside the frame's own estimates, if it takes several.
     """
 
     summary: str
@@ -38,6 +39,7 @@ class Method(NamedTuple):
     denoiser: str | None = None
     pure: bool = False
     variant: oidn.Variant | None = None
+    bases: tuple[str, ...] = ()
 
     def image(self, key: Key, frame: Frame, *estimates: Any) -> Image:
         """Return the image alone, [H,W,C]."""
@@ -85,6 +87,19 @@ def _james_stein(summary: str, **options: Any) -> Method:
     plan = lambda key, frame, y: james_stein.plan_frame(frame, y, **options)
     return Method(summary, james_stein.NEEDS, "one estimate", plan, pure=True)
 
+
+BASES = (
+    *(name for name in oidn.VARIANTS if not oidn.VARIANTS[name].turned),
+    *("bilateral", "rdfc", "pd"),
+)
+"""What `ensemble` is made of beside a frame's own estimates; the variants of eight
+turns lower its error little, and take eight times as long."""
+
+FEW = (
+    *("oidn", "path-tracing", "oidn-demodulated", "nonlocal-means"),
+    *("whitened", "multi-scale"),
+)
+"""What `neural-ensemble` and the tier `balanced` are made of."""
 
 METHODS: dict[str, Method] = {
     **{
@@ -178,17 +193,20 @@ METHODS: dict[str, Method] = {
         ensemble.NEEDS,
         "estimates",
         make=lambda key, frame, bases: ensemble.combine_frame(frame, bases),
+        bases=BASES,
+    ),
+    "neural-ensemble": Method(
+        "ensemble of a few estimates, its weights corrected by a trained network",
+        ensemble.NEURAL_NEEDS,
+        "estimates",
+        make=lambda key, frame, bases: ensemble.neural_combine_frame(
+            _network("neural-ensemble"), frame, bases
+        ),
+        bases=FEW,
     ),
 }
 """By name; the cheaper first among the combiners. Uncorrelated kernels are not here:
 they combine two renderings (`uncorrelated.combine_frame`)."""
-
-BASES = (
-    *(name for name in oidn.VARIANTS if not oidn.VARIANTS[name].turned),
-    *("bilateral", "rdfc", "pd"),
-)
-"""What `ensemble` is made of beside a frame's own estimates; the variants of eight
-turns lower its error little, and take eight times as long."""
 
 
 def table() -> str:

@@ -11,7 +11,7 @@ from jscomb import ensemble, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame
 from jscomb.methods._inputs import given_to, inputs, with_inputs
-from jscomb.methods._table import METHODS
+from jscomb.methods._table import FEW, METHODS
 from jscomb.numerics.tiles import compiled
 from jscomb.typing import Key
 
@@ -33,17 +33,12 @@ class Tier(NamedTuple):
     denoisings: float
 
 
-_BALANCED = (
-    *("oidn", "path-tracing", "oidn-demodulated", "nonlocal-means"),
-    *("whitened", "multi-scale"),
-)
-
 TIERS: dict[str, Tier] = {
     "fast": Tier("`multi-scale` with one denoised image", ("oidn",), 1.5),
-    "balanced": Tier("ensemble of a few estimates", _BALANCED, 10.0),
+    "balanced": Tier("ensemble of a few estimates", FEW, 10.0),
     "best": Tier(
         "ensemble of more denoisers and combiners",
-        (*_BALANCED, "bilateral", "oidn-clean", "pd", "double-shrinkage"),
+        (*FEW, "bilateral", "oidn-clean", "pd", "double-shrinkage"),
         60.0,
     ),
 }
