@@ -172,7 +172,7 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         "double_shrinkage.dependence": (
             lambda r: double_shrinkage.dependence(*r[:4]).correlation
         ),
-        "double_shrinkage.confidence": lambda r: double_shrinkage.confidence(
+        "double_shrinkage.prior_error": lambda r: double_shrinkage.prior_error(
             r.biased, *_of_radiance(r), shared(r)
         ),
         "double_shrinkage.limit_prior": lambda r: double_shrinkage.limit_prior(
