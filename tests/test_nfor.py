@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jscomb import exr
+from jscomb import combine, exr, james_stein
 from jscomb.denoisers import bilateral, nfor, nonlocal_means, rdfc, smoothing
 from jscomb.frame import make_frame
 from jscomb.metrics import rel_l2
@@ -204,7 +204,8 @@ def test_nfor_of_a_bare_frame(rng):
     run = lambda frame: nfor.denoise_frame(frame, window=3)
     eight = run(make_frame(color))
     assert eight.halves.shape == (2, 9, 10, 3)
-    assert run(make_frame(color[:4])).halves is None
+    four = run(make_frame(color[:4]))  # both fits
+    np.testing.assert_allclose(four.image, four.halves.mean(axis=0), rtol=1e-12)
     given = make_frame(color[:4], variance=np.full((4, 9, 10, 3), 0.01))
     assert run(given).halves is not None
     good_half = color[4:, 4, 4].mean(axis=0)
@@ -226,11 +227,32 @@ def test_nfor_has_halves_where_each_is_a_frame_for_it(buffers, given, halves, rn
     variance = jnp.full(color.shape, 0.01) if given else None
     frame = make_frame(color, variance=variance)
     made = nfor.denoise_frame(frame, window=3)
-    assert (made.halves is not None) == halves
+    pair = frame.halves()
     if halves:
-        for half, image in zip(frame.halves(), made.halves, strict=True):
-            alone = nfor.denoise_frame(half, window=3).image
-            np.testing.assert_allclose(image, alone, rtol=1e-12)
+        expected = [nfor.denoise_frame(half, window=3).image for half in pair]
+    else:  # its own two fits, which share their weights
+        none = frame.color[..., :0]
+        given = [i for name in ("color", "variance") for i in map(_of(name), pair)]
+        expected = nfor.denoise(*given, none, none, window=3)
+        np.testing.assert_allclose(made.image, np.mean(expected, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(made.halves, expected, rtol=1e-12)
+
+
+def _of(name):
+    """An image of a frame."""
+    return lambda frame: getattr(frame, name)
+
+
+def test_two_sub_buffers_are_enough_for_an_ensemble_of_nfor(rng):
+    """And for cross-regression towards its two outputs (NJS fig. 16)."""
+    color = rng.uniform(0.5, 1, (2, 16, 16, 3))
+    frame = make_frame(color, variance=np.full(color.shape, 0.02)).normalised()
+    names = ["nfor", "path-tracing"]
+    made = combine(jax.random.key(0), frame, method="ensemble", biased=names)
+    assert np.isfinite(made.halves).all()
+    y = nfor.denoise_frame(frame)
+    regressed = james_stein.regress(jax.random.key(0), frame, y)
+    assert np.isfinite(regressed.estimate.image).all()
 
 
 def depends(function, images, k, reach):

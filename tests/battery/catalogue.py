@@ -223,6 +223,12 @@ def combiners() -> dict[str, Entry]:
             multiple=mixed.multiple,
         ),
         "uncorrelated.combine": Entry(_uncorrelated(uncorrelated.combine, 2), 7),
+        "uncorrelated.combine of both": Entry(
+            _uncorrelated(functools.partial(uncorrelated.combine, guides="both"), 4), 7
+        ),
+        "uncorrelated.combine_median": Entry(
+            _uncorrelated(uncorrelated.combine_median, 4), 7
+        ),
         "uncorrelated.combine_crosswise": Entry(
             _uncorrelated(uncorrelated.combine_crosswise, 4), 7
         ),

@@ -204,6 +204,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
             jnp.stack(r[:3], axis=2)
         ),
         "uncorrelated.select_gamma": lambda r: uncorrelated.select_gamma(*flow(r)),
+        "uncorrelated.select_gamma_map": (
+            lambda r: uncorrelated.select_gamma_map(*flow(r), region=9)
+        ),
         "uncorrelated.relative_variances": (
             lambda r: uncorrelated.relative_variances(*flow(r))
         ),

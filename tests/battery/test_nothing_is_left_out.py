@@ -74,6 +74,7 @@ ELSEWHERE = {
         "sure.exact_sure",
         "uncorrelated.admissibility",
         "uncorrelated.combine_with",
+        "uncorrelated.median_kernel",
         "uncorrelated.variance_kernel",
     },
     "what others are held against, in float64": {
