@@ -241,7 +241,7 @@ def denoise_frame(frame: Frame, *, window: int = 19, stride: int = 1) -> Estimat
     if NEEDS.missing_for_halves(frame):
         both = jnp.stack(_denoise_both(frame, window, stride))
         return Estimate(jnp.mean(both, axis=0), both)
-    mean = lambda part: sum(_denoise_both(part, window, stride)) / 2
+    mean = lambda part: jnp.mean(jnp.stack(_denoise_both(part, window, stride)), axis=0)
     return with_halves(frame, mean, needs=NEEDS)
 
 

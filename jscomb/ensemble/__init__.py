@@ -43,12 +43,17 @@ Sources:
 from jscomb.ensemble._combine import (
     average,
     combine,
-    filter_weights,
     one_hot,
     solve_weights,
     spread,
 )
-from jscomb.ensemble._estimate import error_matrix, mse_matrix, true_matrix
+from jscomb.ensemble._estimate import (
+    error_matrix,
+    mse_matrix,
+    selection_errors,
+    true_matrix,
+)
+from jscomb.ensemble._filter import Filter, filter_weights
 from jscomb.ensemble._frame import (
     NEEDS,
     Stacked,
@@ -73,6 +78,7 @@ __all__ = [
     "NEEDS",
     "NEURAL_NEEDS",
     "Candidates",
+    "Filter",
     "Selected",
     "Stacked",
     "average",
@@ -90,6 +96,7 @@ __all__ = [
     "one_hot",
     "plan_neural_weights",
     "select_bases",
+    "selection_errors",
     "solve_weights",
     "spread",
     "stack_estimates",

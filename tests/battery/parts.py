@@ -162,6 +162,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         ),
         "ensemble.average": lambda r: ensemble.average(bases(r)[0], weights(r)),
         "ensemble.spread": lambda r: ensemble.spread(bases(r)[0], weights(r)),
+        "ensemble.selection_errors": lambda r: ensemble.selection_errors(
+            *_of_bases(r), r.variance, r.variance
+        ),
         "ensemble.one_hot": lambda r: ensemble.one_hot(jnp.square(bases(r)[0])),
         "double_shrinkage.unbiased_error": (
             lambda r: double_shrinkage.unbiased_error(*_of_radiance(r))
