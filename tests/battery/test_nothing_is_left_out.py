@@ -54,6 +54,7 @@ ELSEWHERE = {
         "oidn.tune",
         "oidn.tune_frame",
         "progressive.combine_frame",
+        "rdfc.denoise_selected_frame",
         "progressive.neural_combine_frame",
         "progressive.neural_inputs",
         "progressive.plan_neural",
@@ -82,6 +83,7 @@ ELSEWHERE = {
         "simplex.reference_quadratic",
     },
     "of features, which have no unit": {"oidn.denoise_feature"},
+    "selects filters that are here by a risk that is here": {"rdfc.denoise_selected"},
     "not of images": {"james_stein.rule_of", "oidn.available", "oidn.pretrained"},
 }
 ROOMS = (
