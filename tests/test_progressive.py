@@ -7,10 +7,12 @@ import pytest
 from jax.scipy.special import ndtr
 from jax.test_util import check_grads
 
-from jscomb import progressive
-from jscomb.denoisers import smoothing
+from jscomb import exr, progressive
+from jscomb.denoisers import oidn, smoothing
 from jscomb.frame import make_frame
+from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
+from tests.conftest import DATA
 from tests.statistics import assert_mean, assert_mean_below
 
 _RNG = np.random.default_rng(6)
@@ -260,3 +262,15 @@ def test_bad_input():
         progressive.combine(X, Y, V, S[1:])
     with pytest.raises(ValueError, match="window must be odd"):
         progressive.mixing(X, Y, V, S, window=4)
+
+
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+@pytest.mark.parametrize("samples", [64, 1024])
+def test_mixing_lowers_a_real_frames_error(samples):
+    """Against the denoised image, and against path tracing."""
+    frame = exr.read_frame(DATA / f"cornell-glass-{samples}.exr").normalised()
+    mixed = progressive.combine_frame(jax.random.key(1), oidn.denoise_color, frame)
+    reference, difference = frame.reference
+    error = lambda image: rel_l2(image, reference, half_difference=difference)
+    assert error(mixed.image) < error(oidn.denoise_frame(frame).image)
+    assert error(mixed.image) < error(frame.color)

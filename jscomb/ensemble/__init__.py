@@ -25,6 +25,10 @@ are local, with few there is almost one weight a base for the frame. A pixel who
 buffer is noisy has less weight in these means; weights vary slowly, so they are solved
 for in blocks of 4x4 pixels and interpolated.
 
+The paper's figure 7 has slightly less error with weights of each channel than with one
+weight a base (there of single pixels); multi-scale weights are one by default, since
+`<M>` averaged over channels is less noisy, and of each channel with `shared=False`.
+
 Consistent if one base is: its error vanishes as samples grow, and so does the minimum.
 
 A network can correct these weights pixel by pixel (`neural_combine`): it sees the

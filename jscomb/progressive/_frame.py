@@ -18,7 +18,13 @@ from jscomb.numerics.sure import monte_carlo_sure
 from jscomb.numerics.tiles import Local, compiled, network_plan
 from jscomb.numerics.variances import robust_variance
 from jscomb.numerics.windows import reach_of
-from jscomb.progressive._combine import BOUND_WINDOW, Width, bound_sigma, combine
+from jscomb.progressive._combine import (
+    BOUND_WINDOW,
+    Noise,
+    Width,
+    bound_sigma,
+    combine,
+)
 from jscomb.progressive._estimate import channel_variance, mixing
 from jscomb.progressive._neural import Network, combine_inputs
 from jscomb.typing import Image, Key, Variance
@@ -202,6 +208,6 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
     return {"unbiased": x, "biased": y, "variance": v, "sure": s, "noise": noise}
 
 
-def _of_grey(variance: Variance) -> Image:
+def _of_grey(variance: Variance) -> Noise:
     """Variance of the mean of channels that have one noise, [H,W,1]."""
     return jnp.square(jnp.mean(safe_sqrt(variance), axis=-1, keepdims=True))
