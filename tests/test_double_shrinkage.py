@@ -72,6 +72,27 @@ def test_limits():
     np.testing.assert_array_equal(combine(p, u, b, none, none, none), u)
 
 
+def test_an_infinite_error_leaves_the_image_out():
+    """The limit of eq. 9 and 10; u where nothing is known of any."""
+    p, u, b, v, m, eta = images()
+    endless = jnp.full_like(v, jnp.inf)
+    share = v / (v + eta)
+    no_b = share * p + (1 - share) * u
+    np.testing.assert_allclose(combine(p, u, b, v, endless, eta), no_b, rtol=1e-12)
+    one = endless[..., :1]
+    np.testing.assert_allclose(combine(p, u, b, v, one, eta), no_b, rtol=1e-12)
+    np.testing.assert_allclose(combine(p, u, b, v, 1e20 * m, eta), no_b, rtol=1e-12)
+    np.testing.assert_array_equal(combine(p, u, b, v, endless, endless), u)
+    share = m / (m + eta)
+    no_u = share * p + (1 - share) * b
+    np.testing.assert_allclose(combine(p, u, b, endless, m, eta), no_u, rtol=1e-12)
+    np.testing.assert_array_equal(combine(p, u, b, endless, endless, eta), p)
+    np.testing.assert_array_equal(combine(p, u, b, endless, endless, endless), u)
+    found = double_shrinkage.factors(v, endless, eta)
+    np.testing.assert_array_equal(found.biased, 0)
+    np.testing.assert_array_equal(found.error, v)
+
+
 def test_factors():
     _, _, _, v, m, eta = images()
     found = double_shrinkage.factors(v, m, eta)
@@ -102,6 +123,9 @@ def test_gradients():
         (0 * v, 0 * m, 0 * eta),
         (v, m, 0 * eta),
         (v, m, eta + jnp.inf),
+        (v, m + jnp.inf, eta),
+        (v + jnp.inf, m, eta),
+        (v + jnp.inf, m + jnp.inf, eta + jnp.inf),
     ):
         for part in gradient(p, u, b, *zero):
             assert np.isfinite(part).all()
@@ -141,7 +165,7 @@ def test_bad_input(unchecked):
 
 
 def likeness(i, js, image, error, epsilon, less):
-    """Weights of pixels js about i, eq. 12, or eq. 17 less the noise."""
+    """Weights of pixels js about i, eq. 12, or eq. 17 less the channels' noise."""
     both = (error[i] + error[js])[:, 0]
     square = ((image[i] - image[js]) ** 2).sum(axis=1)
     return np.exp(-(square - less * both) / (both + epsilon))
@@ -167,7 +191,7 @@ def prior_oracle(u, b, v, m, f, *, window, epsilon=0.01, ridge=0.1, floor=0.1):
         normal += ridge * np.diag([0.0] + [1.0] * d.shape[1])
         right = (a * wu[:, None]).T @ u[js] + (a * wb[:, None]).T @ b[js]
         fit = a @ np.linalg.solve(normal, right)
-        predict = likeness(i, js, b, m, epsilon, 1)
+        predict = likeness(i, js, b, m, epsilon, c)
         total[js] += predict[:, None] * fit
         weight[js] += predict[:, None]
     return (total / weight).reshape(h, w, c)
@@ -277,7 +301,7 @@ def test_a_lamp_does_not_decide_for_its_surroundings():
     relative = np.asarray(m / truth**2)
     assert 0.005 < relative.min() < relative.max() < 0.08  # 0.02 in expectation
     u, b = (given[0] + given[1]) / 2, (given[2] + given[3]) / 2
-    eta = double_shrinkage.confidence(
+    eta = double_shrinkage.prior_error(
         jnp.asarray(1.3 * truth), u, b, jnp.asarray(0.005 * truth**2), m, window=15
     )
     relative = np.asarray(eta / truth**2)
@@ -307,7 +331,7 @@ def test_errors_where_b_is_black():
         b = jnp.ones((4, 5, 1)).at[: shape[0], : shape[1]].set(0.0)
         m = double_shrinkage.biased_error(u, u, b, b, window=3)
         np.testing.assert_allclose(m[0, 0], (4 + 4) / 4)
-    eta = double_shrinkage.confidence(0 * u, u, u, 0 * u, 0 * u, window=3)
+    eta = double_shrinkage.prior_error(0 * u, u, u, 0 * u, 0 * u, window=3)
     np.testing.assert_allclose(eta, 4 / 2)
     nothing = double_shrinkage.biased_error(*[0 * u] * 4, window=3)
     np.testing.assert_array_equal(nothing, 0)
@@ -348,24 +372,24 @@ def test_bias_by_radii():
 
 
 @pytest.mark.parametrize("away", [0.0, 1.0])
-def test_confidence_is_the_distance_to_the_truth(away):
+def test_error_of_the_prior_is_its_distance_to_the_truth(away):
     rng, shape, v, m = np.random.default_rng(0), (60, 60, 1), 0.4, 0.6
     truth = LEVEL + rng.standard_normal(shape)
     u = truth + v**0.5 * rng.standard_normal(shape)
     b = truth + m**0.5 * rng.standard_normal(shape)
     p = truth + away
     full = lambda value: jnp.full(shape, value)
-    found = double_shrinkage.confidence(
+    found = double_shrinkage.prior_error(
         *map(jnp.asarray, (p, u, b)), full(v), full(m), window=31
     )
     assert abs(found[30, 30, 0] - away**2) < 0.1
     assert np.all(np.asarray(found) >= 0)
 
 
-def test_confidence_leaves_bad_pixels_out():
+def test_error_of_the_prior_leaves_bad_pixels_out():
     p, u, b, v, m, _ = images()
-    bad = double_shrinkage.confidence(p.at[2, 2].set(jnp.nan), u, b, v, m, window=3)
-    clean = double_shrinkage.confidence(p, u, b, v, m, window=3)
+    bad = double_shrinkage.prior_error(p.at[2, 2].set(jnp.nan), u, b, v, m, window=3)
+    clean = double_shrinkage.prior_error(p, u, b, v, m, window=3)
     assert np.isfinite(bad).all()
     np.testing.assert_array_equal(bad[:, 4:], clean[:, 4:])
 
@@ -386,7 +410,7 @@ def test_a_frame_is_made_of_the_parts(glass_frame):
     x1, s = first.blend(u, y.image), one(first.error)
     p = prior(x1, x1, s, s, features, window=9)
     p = double_shrinkage.limit_prior(p, u, y.image, v)
-    eta = double_shrinkage.confidence(p, u, y.image, v, m)
+    eta = double_shrinkage.prior_error(p, u, y.image, v, m)
     expected = combine(p, u, y.image, v, m, eta)
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-3)
     inputs = double_shrinkage.make_inputs(frame, y, **options)
@@ -425,7 +449,7 @@ class Pooling(NamedTuple):
     reach, multiple, window = 1, 1, 13
 
     def __call__(self, p, u, b, v, m):
-        """Narrower kernels and more confidence where the images differ."""
+        """Narrower kernels and a worse prior where the images differ."""
         width, differences = 2 * self.reach + 1, jnp.mean(abs(u - b), -1, keepdims=True)
         features = self.rate * window_mean(differences, width)
         steps = jnp.linspace(0, 1, 2 * 13**2, dtype=features.dtype)

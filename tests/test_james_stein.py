@@ -174,6 +174,16 @@ def test_whitened_dominates_under_unequal_variances(bias):
     assert_mean_below(jnp.sum((out - x) / sigma[None] ** 2, axis=(1, 2, 3)), 0.0)
 
 
+def test_whitened_does_not_dominate_in_squared_error():
+    """One pixel of variance 1e4 and y off by 300 there: six times the error of x."""
+    sigma = jnp.ones(ONE_WINDOW).at[3, 3].set(100.0)
+    bias = jnp.zeros(ONE_WINDOW).at[3, 3].set(300.0)
+    options = {"window": 15, "whiten": True, "count": 4000}
+    x, out = errors(jax.random.key(2), bias, sigma, **options)
+    assert_mean_below(jnp.sum((out - x) / sigma[None] ** 2, axis=(1, 2, 3)), 0.0)
+    assert_mean_below(jnp.sum(5 * x - out, axis=(1, 2, 3)), 0.0)
+
+
 @pytest.mark.parametrize("bias", [0.0, 0.3, 3.0])
 @BOTH
 def test_dominates_when_windows_overlap(bias, whiten):

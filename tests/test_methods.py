@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import combine, exr, james_stein, methods, metrics
+from jscomb import combine, exr, james_stein, methods, metrics, uncorrelated
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Needs, make_frame
 from jscomb.methods import BASES, METHODS, TIERS, Method, combine_tier
@@ -42,8 +42,12 @@ def small(glass_frame):
     return cut(glass_frame, 24)
 
 
+# Of any frame: what takes a second rendering has a test of its own.
+ALONE = [name for name, method in METHODS.items() if method.input is None]
+
+
 @needs_oidn
-@pytest.mark.parametrize("name", slow_ones(METHODS))
+@pytest.mark.parametrize("name", slow_ones(ALONE))
 def test_every_method_makes_an_estimate(name, small):
     """Finite, and each half is what the method makes of that half alone."""
     frame = small
@@ -64,7 +68,7 @@ def test_every_method_makes_an_estimate(name, small):
 
 
 @needs_oidn
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", ALONE)
 def test_the_unit_of_the_frame_does_not_matter(name, small):
     frame = small.merged(2)
     made = METHODS[name].needs.missing(frame.normalised())
@@ -75,6 +79,26 @@ def test_the_unit_of_the_frame_does_not_matter(name, small):
     inside = combine(key(), frame.normalised(), method=name).image
     unit = frame.median_luminance
     np.testing.assert_allclose(unit * inside, one, rtol=1e-5, atol=1e-7)
+
+
+def test_a_second_rendering_is_a_base_of_an_ensemble(small):
+    """As `uncorrelated` in the table, of the estimate of that name only."""
+    z = jnp.stack([half.color for half in small.halves()])
+    with pytest.raises(ValueError, match="uncorrelated needs an estimate 'correlated'"):
+        combine(key(), small, method="uncorrelated")
+    _, skipped = methods.inputs(small.normalised(), biased="uncorrelated")
+    assert "needs an estimate 'correlated'" in skipped["uncorrelated"]
+    frame = small.with_estimate("correlated", Estimate(small.color, z))
+    made = combine(key(), frame, method="uncorrelated")
+    expected = uncorrelated.combine_frame(
+        frame.normalised(), frame.normalised().estimates["correlated"]
+    ).scaled(small.median_luminance)
+    for image, other in zip(made, expected, strict=True):
+        np.testing.assert_allclose(image, other, rtol=1e-5)
+    names = ["path-tracing", "uncorrelated"]
+    found = combine(key(), frame, method="ensemble", biased=names)
+    assert np.isfinite(found.halves).all()
+    assert combine_tier(key(), frame, biased=names).bases == tuple(names)
 
 
 def test_unchanged_is_bit_by_bit(glass_frame):

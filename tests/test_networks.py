@@ -136,9 +136,9 @@ def njs_outputs(network, image):
 
 
 def dsc_outputs(network, image):
-    """Weights and confidence."""
-    kernels, confidence = network(*3 * [image], *2 * [image[..., :1]])
-    return jnp.concatenate([outputs(kernels), confidence], axis=-1)
+    """Weights, and the error of the prior."""
+    kernels, prior_mse = network(*3 * [image], *2 * [image[..., :1]])
+    return jnp.concatenate([outputs(kernels), prior_mse], axis=-1)
 
 
 def ensemble_of(image):
@@ -204,7 +204,7 @@ def test_sizes_are_the_papers():
     assert shapes.first.kernel.get_value() == (5, 5, 18, 48)
     assert shapes.last.kernel.get_value() == (3, 3, 48, 9)
     shrinkage = networks.ShrinkageNetwork(key())
-    outputs = [c.kernel.shape[-1] for c in (shrinkage.kernels, shrinkage.confidence)]
+    outputs = [c.kernel.shape[-1] for c in (shrinkage.kernels, shrinkage.prior_mse)]
     assert sum(outputs) == 339  # DSC: 2 13^2 + 1
     for kind in (networks.JamesSteinNetwork, networks.MixingNetwork):
         light, full = (parameters_of(kind(key(), size=s)) for s in ("light", "full"))
@@ -354,7 +354,7 @@ def test_unit_kernels_are_double_shrinkage_of_single_pixels(images):
         return double_shrinkage.Filters(both(u), eta)
 
     found = double_shrinkage.neural_combine(network, p, x, y, one, one / 3)
-    # The network's confidence is that of normalised images.
+    # The network's error of the prior is that of normalised images.
     square = jnp.square(median_luminance(x))
     wanted = double_shrinkage.combine(p, x, y, one, one / 3, square * eta)
     np.testing.assert_allclose(found, wanted, rtol=1e-10)

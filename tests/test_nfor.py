@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jscomb import exr
+from jscomb import combine, exr, james_stein
 from jscomb.denoisers import bilateral, nfor, nonlocal_means, rdfc, smoothing
 from jscomb.frame import make_frame
 from jscomb.metrics import rel_l2
+from jscomb.numerics.sure import monte_carlo_sure
 from tests.conftest import DATA
 
 SIZES = {"window": 7, "patch": 3}
@@ -116,6 +117,62 @@ def test_rdfc_of_a_frame():
         assert error(base) < 0.3 * error(half.color)
 
 
+def test_rdfc_selects_by_risk(rng):
+    """By the parts, step after step; one candidate is itself."""
+    x, v = jnp.asarray(rng.normal(1, 0.3, (20, 18, 3))), jnp.full((20, 18, 3), 0.09)
+    f = jnp.asarray(np.mgrid[:20, :18][0] > 9, float)[..., None]
+    first, options = rdfc.CANDIDATES[0], {"window": 7}
+    key = jax.random.key(3)
+    every, risks = [], []
+    keys = jax.random.split(jax.random.clone(key), 3)
+    for one, candidate in zip(keys, rdfc.CANDIDATES, strict=True):
+        run = lambda i, c=candidate: rdfc.denoise(i, i, v, f, **options, **c._asdict())
+        found = monte_carlo_sure(one, run, x, v, slope_limit=1.0)
+        every.append(np.asarray(found.denoised))
+        risks.append(found.squared_error.mean(axis=-1))
+    by_first = lambda i: rdfc.denoise(i, x, v, f, **options, **first._asdict())
+    risk = np.asarray(by_first(jnp.stack(risks, axis=-1)))
+    chosen = (risk.argmin(-1)[..., None] == np.arange(3)).astype(float)
+    assert 0.05 < chosen.mean(axis=(0, 1)).max() < 0.95
+    shares = np.asarray(by_first(jnp.asarray(chosen)))
+    expected = sum(shares[..., k, None] * y for k, y in enumerate(every))
+    found = rdfc.denoise_selected(key, x, v, f, **options)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    alone = rdfc.denoise_selected(jax.random.key(3), x, v, f, candidates=[first])
+    np.testing.assert_allclose(alone, rdfc.denoise(x, x, v, f, **first._asdict()))
+    with pytest.raises(ValueError, match="there must be a candidate, got none"):
+        rdfc.denoise_selected(jax.random.key(0), x, v, f, candidates=())
+
+
+def test_rdfc_by_features_alone_does_not_compare_colours():
+    """Not even where a pixel is certain; without features all are alike."""
+    x = jnp.asarray([0.0, 1.0, 5.0, 9.0]).reshape(1, 4, 1)
+    f = jnp.asarray([0.0, 0.0, 1.0, 1.0]).reshape(1, 4, 1)
+    run = lambda f: rdfc.denoise(x, x, 0 * x, f, window=7, strength=np.inf)
+    np.testing.assert_allclose(run(f).ravel(), [0.5, 0.5, 7, 7], atol=1e-3)
+    np.testing.assert_allclose(run(f[..., :0]).ravel(), 15 / 4)
+
+
+def test_rdfc_selection_beats_its_candidates(rng):
+    """Where one half has texture that no feature shows, the other only features."""
+    y, z = np.mgrid[:48, :48]
+    texture = np.where(z < 24, np.sign(np.sin(y * 1.3)), 0.0)
+    edge = np.where((z >= 24) & ((y + z) % 12 < 6), 0.6, 0.0)
+    truth = (2 + texture + edge)[..., None]
+    v = jnp.full(truth.shape, 0.16)
+    f = jnp.asarray(edge)[..., None]
+    errors = []
+    for seed in range(3):
+        x = jnp.asarray(truth + 0.4 * rng.standard_normal(truth.shape))
+        made = [rdfc.denoise_selected(jax.random.key(seed), x, v, f, window=11)]
+        made += [
+            rdfc.denoise(x, x, v, f, window=11, **c._asdict()) for c in rdfc.CANDIDATES
+        ]
+        errors.append([float(jnp.mean((i - truth) ** 2)) for i in made])
+    selected, *alone = np.mean(errors, axis=0)
+    assert selected < 0.9 * min(alone)
+
+
 def test_rdfc_keeps_apart_what_the_noise_hides():
     side = jnp.asarray(np.tile(np.arange(12)[:, None] > 5, (9, 1, 1)), float)
     guide, variance = 0.1 * side, jnp.ones_like(side)
@@ -204,7 +261,8 @@ def test_nfor_of_a_bare_frame(rng):
     run = lambda frame: nfor.denoise_frame(frame, window=3)
     eight = run(make_frame(color))
     assert eight.halves.shape == (2, 9, 10, 3)
-    assert run(make_frame(color[:4])).halves is None
+    four = run(make_frame(color[:4]))  # both fits
+    np.testing.assert_allclose(four.image, four.halves.mean(axis=0), rtol=1e-12)
     given = make_frame(color[:4], variance=np.full((4, 9, 10, 3), 0.01))
     assert run(given).halves is not None
     good_half = color[4:, 4, 4].mean(axis=0)
@@ -226,11 +284,32 @@ def test_nfor_has_halves_where_each_is_a_frame_for_it(buffers, given, halves, rn
     variance = jnp.full(color.shape, 0.01) if given else None
     frame = make_frame(color, variance=variance)
     made = nfor.denoise_frame(frame, window=3)
-    assert (made.halves is not None) == halves
+    pair = frame.halves()
     if halves:
-        for half, image in zip(frame.halves(), made.halves, strict=True):
-            alone = nfor.denoise_frame(half, window=3).image
-            np.testing.assert_allclose(image, alone, rtol=1e-12)
+        expected = [nfor.denoise_frame(half, window=3).image for half in pair]
+    else:  # its own two fits, which share their weights
+        none = frame.color[..., :0]
+        given = [i for name in ("color", "variance") for i in map(_of(name), pair)]
+        expected = nfor.denoise(*given, none, none, window=3)
+        np.testing.assert_allclose(made.image, np.mean(expected, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(made.halves, expected, rtol=1e-12)
+
+
+def _of(name):
+    """An image of a frame."""
+    return lambda frame: getattr(frame, name)
+
+
+def test_two_sub_buffers_are_enough_for_an_ensemble_of_nfor(rng):
+    """And for cross-regression towards its two outputs (NJS fig. 16)."""
+    color = rng.uniform(0.5, 1, (2, 16, 16, 3))
+    frame = make_frame(color, variance=np.full(color.shape, 0.02)).normalised()
+    names = ["nfor", "path-tracing"]
+    made = combine(jax.random.key(0), frame, method="ensemble", biased=names)
+    assert np.isfinite(made.halves).all()
+    y = nfor.denoise_frame(frame)
+    regressed = james_stein.regress(jax.random.key(0), frame, y)
+    assert np.isfinite(regressed.estimate.image).all()
 
 
 def depends(function, images, k, reach):

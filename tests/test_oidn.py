@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jscomb import metrics
+from jscomb import exr, metrics
 from jscomb.denoisers import oidn
 from jscomb.denoisers.oidn import (
     _denoise,
@@ -24,6 +24,7 @@ from jscomb.denoisers.oidn._models import MODELS, Model
 from jscomb.frame import Package, make_frame
 from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
+from tests.conftest import DATA
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,23 @@ def frame(glass_frame):
 @pytest.fixture(scope="module")
 def denoised(frame):
     return oidn.denoise_frame(frame)
+
+
+def test_the_stored_image_of_a_crop_was_denoised_whole():
+    """It differs from one made of the crop at the border alone (tests/data/README)."""
+    crop = exr.read_frame(DATA / "cornell-box-64.exr").normalised()
+    reference, difference = crop.reference
+    ratios = []
+    for border in (0, 4):
+        inner = slice(border, 64 - border)
+        at = lambda image, inner=inner: image[inner, inner]
+        stored, anew = (
+            rel_l2(at(made.image), at(reference), half_difference=at(difference))
+            for made in (crop.estimates["oidn"], oidn.denoise_frame(crop))
+        )
+        ratios.append(float(stored / anew))
+    assert ratios[0] < 0.5
+    assert 0.9 < ratios[1] < 1.15
 
 
 def test_lowers_the_error_of_frame_and_halves(glass_frame, frame, denoised):

@@ -35,6 +35,40 @@ def test_radii_shrink_in_pairs():
     assert radii[4] == radii[5]
 
 
+def radii_by_statistics(photons, passes=100, alpha=2 / 3):
+    """Each pixel's radius by Hachisuka and Jensen; `photons` of an area of one."""
+    square, counted, radii = 1.0, 0.0, []
+    for _ in range(passes):
+        radii.append(np.sqrt(square))
+        found = photons(square)
+        total = counted + found
+        shrunk = (counted + alpha * found) / np.where(total > 0, total, 1)
+        square = square * np.where(total > 0, shrunk, 1)
+        counted = counted + alpha * found
+    return radii
+
+
+@pytest.mark.parametrize("density", [1e-3, 1.0, 1e6])
+def test_radii_are_those_of_each_pixels_own_statistics(density):
+    """However many photons there are, in proportion to the area (from pass 2)."""
+    radii = np.array(radii_by_statistics(lambda area: density * area))
+    ours = [photon_mapping.relative_radius(2 * number) for number in range(99)]
+    np.testing.assert_allclose(radii[1:] / radii[1], ours, rtol=1e-12)
+
+
+def test_radii_of_pixels_that_photons_seldom_reach_are_larger():
+    """They wait for a photon; of 20 photons a pass the noise is all that is left."""
+    rng, size = np.random.default_rng(0), 4000
+    exact = radii_by_statistics(lambda area: area)[-1]
+    at = lambda density: radii_by_statistics(
+        lambda area: rng.poisson(density * area * np.ones(size))
+    )[-1]
+    many, few = at(20.0) / exact, at(0.05) / exact
+    np.testing.assert_allclose(many.mean(), 1, atol=0.005)
+    assert 0.02 < many.std() < 0.03
+    assert 1.65 < few.mean() < 1.75
+
+
 def test_the_photons_have_streams_of_their_own():
     every = rendering.plan_passes(dataclasses.replace(SETTINGS, reference_spp=64))
     assert len({p.seed for p in every}) == len(every)

@@ -7,9 +7,12 @@ import pytest
 from jax.scipy.special import ndtr
 from jax.test_util import check_grads
 
-from jscomb import progressive
-from jscomb.denoisers import smoothing
+from jscomb import exr, progressive
+from jscomb.denoisers import oidn, smoothing
+from jscomb.frame import make_frame
+from jscomb.metrics import rel_l2
 from jscomb.numerics import sure
+from tests.conftest import DATA
 from tests.statistics import assert_mean, assert_mean_below
 
 _RNG = np.random.default_rng(6)
@@ -98,6 +101,31 @@ def bound_by_loops(alpha, x, y, v, *, window, strength, shift):
         t = abs(z_bar - x_bar) / np.sqrt(variance)
         out[place] = alpha[place] * float(ndtr(strength * (shift - t)))
     return out
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+def test_widths_of_the_bound(scale):
+    """PD eq. 15 by both readings of its words, and relative to the radiance."""
+    x, v = scale * X, scale**2 * 1e-4 * V
+    noise, radiance = np.asarray(v).sum(-1) / X.shape[-1] ** 2, np.asarray(x).mean(-1)
+    paper = lambda variance: 100 * min(np.sqrt(variance), 1)
+    expected = {
+        "absolute": paper(noise.mean()),
+        "image mean": paper(noise.sum() / noise.size**2),
+        "relative": paper(noise.mean() / abs(radiance).mean() ** 2),
+    }
+    for width, sigma in expected.items():
+        found = progressive.bound_sigma(x, v, width=width)
+        np.testing.assert_allclose(found, max(sigma, 1e-3), rtol=1e-6)
+
+
+def test_the_noise_of_a_single_buffer_is_taken_as_grey():
+    """What nothing tells apart; with half buffers `channel_variance` tells."""
+    frame = make_frame(X, variance=V).normalised()
+    same = lambda color, frame: color
+    found = progressive.neural_inputs(jax.random.key(0), same, frame)
+    expected = np.square(np.sqrt(found["variance"]).mean(-1, keepdims=True))
+    np.testing.assert_allclose(found["noise"], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-4, 1.0])
@@ -234,3 +262,15 @@ def test_bad_input():
         progressive.combine(X, Y, V, S[1:])
     with pytest.raises(ValueError, match="window must be odd"):
         progressive.mixing(X, Y, V, S, window=4)
+
+
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+@pytest.mark.parametrize("samples", [64, 1024])
+def test_mixing_lowers_a_real_frames_error(samples):
+    """Against the denoised image, and against path tracing."""
+    frame = exr.read_frame(DATA / f"cornell-glass-{samples}.exr").normalised()
+    mixed = progressive.combine_frame(jax.random.key(1), oidn.denoise_color, frame)
+    reference, difference = frame.reference
+    error = lambda image: rel_l2(image, reference, half_difference=difference)
+    assert error(mixed.image) < error(oidn.denoise_frame(frame).image)
+    assert error(mixed.image) < error(frame.color)

@@ -231,6 +231,63 @@ def test_affine_weights_have_equal_slopes(rng):
     assert np.isfinite(singular).all()
 
 
+def raw_matrices(rng, n, kind, count=4000):
+    """<M> of single pixels (ED eq. 11, 12) in a precision, and what was rounded."""
+    truth, noise = rng.gamma(2.0, 1.0, count), rng.normal(size=(2, n, count))
+    x = truth + 0.3 * rng.normal(size=(2, count))
+    y = truth + 0.1 * noise + 0.05 * np.arange(n)[:, None]
+    if kind == "x is a base":
+        y[:, -1] = x
+    if kind == "equal bases":
+        y[:, -1] = y[:, 0]
+    if kind == "bases hardly differ":
+        y = y[:, :1] * (1 + 1e-6 * noise)
+    if kind == "black":
+        x[:, ::2], y[..., ::2] = 0, 0
+    if kind == "fireflies":
+        x[0, ::7], y[0, 0, ::7] = 1e6, 1e5
+    if kind == "faint":
+        x, y = 1e-8 * x, 1e-8 * y
+    if kind == "not finite":
+        x[0, ::5] = np.nan
+    halves = [(y[0], x[0], x[1]), (y[1], x[1], x[0])]
+    made = lambda dtype: sum(_raw(*(i.astype(dtype) for i in half)) for half in halves)
+    return made, np.maximum(abs(y).max(axis=(0, 1)), abs(x).max(axis=0)) ** 2
+
+
+def _raw(y, own, other):
+    """Half of one half's <M>, in the images' precision."""
+    pairs = y[:, None] * y[None] - other * (y[:, None] + y[None])
+    return (own * other + pairs) / 2
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [1, 2, 4, 6])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("x is a base", "equal bases", "bases hardly differ", "black", "fireflies"),
+        *("faint", "not finite"),
+    ],
+)
+def test_affine_weights_of_single_pixels_sum_to_one(kind, n, dtype, rng):
+    """Of matrices of rank two at most: no guarded solver, no sum, nor any gradient."""
+    made, level = raw_matrices(rng, n, kind)
+    matrix = made(dtype)
+    w = np.asarray(jax.jit(simplex.affine)(matrix), np.float64)
+    np.testing.assert_allclose(w.sum(0), 1, atol=1e-3 if dtype == np.float32 else 1e-9)
+    assert abs(w).max() <= 1002
+    known = np.isfinite(matrix).all(axis=(0, 1))
+    np.testing.assert_allclose(w[:, ~known], 1 / n, rtol=1e-6)
+    m, w = (i[..., known].astype(np.float64) for i in (matrix, w))
+    error = np.einsum("im,ijm,jm->m", w, m, w)
+    best = np.stack([m[i, i] for i in range(n)]).min(0)
+    size = (1 + abs(w).sum(0)) ** 2 * level[known]
+    assert ((error - best) <= 50 * np.finfo(dtype).eps * size).all()
+    gradient = jax.jit(jax.grad(lambda m: jnp.sum(jnp.sin(simplex.affine(m)))))
+    assert np.isfinite(gradient(matrix)).all()
+
+
 @pytest.mark.parametrize("n", [2, 4])
 @pytest.mark.parametrize("kind", ["anywhere", "inside"])
 def test_gradients(n, kind, rng):

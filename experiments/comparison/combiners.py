@@ -130,7 +130,11 @@ def combiners() -> dict[str, Combiner]:
     """
     return {
         "path tracing": Combiner(lambda frame, scale: frame.color, 0, traced=True),
-        **{name: _of_method(name, method) for name, method in METHODS.items()},
+        **{
+            name: _of_method(name, method)
+            for name, method in METHODS.items()
+            if method.input is None  # a second rendering is not one of these frames'
+        },
         # The frame's own, whose time is counted apart.
         "oidn": Combiner(
             lambda frame, scale: frame.estimates["oidn"].image, 1, traced=True

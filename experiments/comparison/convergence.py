@@ -2,10 +2,13 @@
 
 Of what `comparison.sweep` measured: the slope of log error against log samples (-1 is
 unbiased), by least squares over the sample counts, and the ratio to path tracing at the
-last one (NJS figures 1, 8, 11, 13, 14, 16). With `--biased` frames of the sweep's work
-folder are combined with a severely biased image instead: path tracing, blurred by a
-15x15 box (figures 5, 6); a combiner that dominates stays below path tracing. Give these
-results a file of their own: other experiments would average over both.
+last one: curves as in NJS figure 1, of the combiners that the sweep measured, with Open
+Image Denoise in place of the paper's denoisers. Not its ensembles first (figure 14),
+NFOR's outputs for y* (16) or other integrators (18). With `--biased` frames of the
+sweep's work folder are combined with a severely biased image instead: path tracing,
+blurred by a 15x15 box (figures 5, 6); a combiner that dominates stays below path
+tracing. Give these results a file of their own: other experiments would average over
+both.
 """
 
 import dataclasses

@@ -5,6 +5,7 @@ and the plain scene with 64 and 4096, into the work folder (resumable, about 12 
 on two cores with LLVM). Writes `jscomb/data/` with two sub-buffers, in 16 bits where no
 error is measured, and 64x64 crops with all four to `tests/data/`, beside small frames
 of random scenes of the test split of `experiments.data.dataset`, photon mapped too.
+Crops are cut from frames that were denoised whole (`tests/data/README.md`).
 """
 
 import dataclasses

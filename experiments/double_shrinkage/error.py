@@ -226,7 +226,7 @@ def ablations(half: Frame) -> dict[str, Image]:
     w, m = found.variance, found.mse
 
     def towards(prior: Image) -> Image:
-        eta = double_shrinkage.confidence(prior, u, b.image, w, m)
+        eta = double_shrinkage.prior_error(prior, u, b.image, w, m)
         return double_shrinkage.combine(prior, u, b.image, w, m, eta)
 
     one = lambda errors: jnp.mean(errors, axis=-1, keepdims=True)
@@ -344,7 +344,7 @@ def picture(whole: Frame, half: Frame, images: Mapping[str, Image]) -> Figure:
     """The images, and what share the biased image and the prior have."""
     assert whole.reference is not None
     found = double_shrinkage.make_inputs(half, half.estimates[PHOTONS])
-    share = double_shrinkage.factors(found.variance, found.mse, found.confidence)
+    share = double_shrinkage.factors(found.variance, found.mse, found.prior_mse)
     shown = {
         "reference": whole.reference.image,
         "path tracing, all the time": images["path tracing alone"],

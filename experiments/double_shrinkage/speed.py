@@ -43,7 +43,7 @@ def calls_of_rest(size: int) -> dict[str, Callable]:
     functions = {
         "combine": (double_shrinkage.combine, 6),
         "biased_error": (double_shrinkage.biased_error, 4),
-        "confidence": (double_shrinkage.confidence, 5),
+        "prior error": (double_shrinkage.prior_error, 5),
     }
     return {
         **{f"{n} images": stream(n) for n in (4, 5, 6)},
@@ -78,6 +78,6 @@ def ratios(size: int, repeats: int) -> dict[str, float]:
         "combine / six images": s["combine"] / s["6 images"],
         "biased_error / three window sums": s["biased_error"] / s["three window sums"],
         "biased_error / four images": s["biased_error"] / s["4 images"],
-        "confidence / two window sums": s["confidence"] / s["two window sums"],
-        "confidence / five images": s["confidence"] / s["5 images"],
+        "prior error / two window sums": s["prior error"] / s["two window sums"],
+        "prior error / five images": s["prior error"] / s["5 images"],
     }

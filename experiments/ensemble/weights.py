@@ -62,6 +62,21 @@ def combined(**options) -> Callable:
     )
 
 
+def selected(**options) -> Callable:
+    """One base a pixel by eq. 36 and 37, compiled."""
+    return jax.jit(
+        lambda full, a, b, xa, xb, v, albedo, normal: ensemble.combine(
+            *(full, a, b, xa, xb),
+            solver="one-hot",
+            variance_a=2 * v,
+            variance_b=2 * v,
+            albedo=albedo,
+            normal=normal,
+            **options,
+        )
+    )
+
+
 def weighed(weigh: Callable) -> Callable:
     """The ensemble with weights from the halves, compiled."""
     return jax.jit(
@@ -78,64 +93,61 @@ def over(*windows: int, whole_frame: bool = False) -> Callable:
     )
 
 
-def errors_of(*halves, window: int = 1, shared: bool = False):
-    """Estimated error of each base over a window, relative, [N,H,W,C or 1]."""
-    matrix = ensemble.error_matrix(
-        *halves, windows=(window,), whole_frame=False, shared=shared
-    )
-    return jnp.stack([m[k] for k, m in enumerate(matrix)])
-
-
 def one_hot(window: int) -> Callable:
-    """The base of least error over a window."""
-    return lambda *halves: ensemble.one_hot(
-        errors_of(*halves, window=window, shared=True)
-    )
+    """The base of least error over a window, of all channels and relative."""
+
+    def weigh(*halves):
+        matrix = ensemble.error_matrix(*halves, windows=(window,), whole_frame=False)
+        return ensemble.one_hot(jnp.stack([m[k] for k, m in enumerate(matrix)]))
+
+    return weigh
 
 
-def smooth(images, a, b, albedo, normal):
-    """Images of all bases under the filter for weights, guided by the bases' mean."""
-    z, z_a, z_b = (jnp.mean(i, axis=0) for i in ((a + b) / 2, a, b))
-    noise = jnp.square(z_a - z_b) / 2
+def smooth(images, z, noise, albedo, normal):
+    """Images of all bases under the filter for weights."""
     return ensemble.filter_weights(images, z, noise, albedo=albedo, normal=normal)
 
 
 @jax.jit
 def one_hot_bilateral(full, a, b, xa, xb, v, albedo, normal):
-    """The base of least error, errors filtered like weights."""
-    found = smooth(errors_of(a, b, xa, xb), a, b, albedo, normal)
+    """The base of least error, errors filtered like weights, by the noisy image."""
+    found = ensemble.selection_errors(a, b, xa, xb, 2 * v, 2 * v)
+    found = smooth(found, (xa + xb) / 2, v, albedo, normal)
     return ensemble.average(full, ensemble.one_hot(found))
 
 
 @jax.jit
 def one_hot_means(full, a, b, xa, xb, v, albedo, normal):
     """The base of least error, errors filtered by non-local means."""
-    found = jnp.moveaxis(errors_of(a, b, xa, xb), 0, 2)
+    found = ensemble.selection_errors(a, b, xa, xb, 2 * v, 2 * v)
+    found = jnp.moveaxis(found, 0, 2)
     flat = found.reshape(*xa.shape[:2], -1)
     filtered = nonlocal_means.denoise(flat, (xa + xb) / 2, v).reshape(found.shape)
     return ensemble.average(full, ensemble.one_hot(jnp.moveaxis(filtered, 2, 0)))
 
 
-@jax.jit
-def one_hot_after(full, a, b, xa, xb, v, albedo, normal):
-    """The base of least error, and then its weights filtered."""
-    weights = ensemble.one_hot(errors_of(a, b, xa, xb))
-    return ensemble.average(full, smooth(weights, a, b, albedo, normal))
-
-
 METHODS = {
     "average": weighed(lambda a, *_: jnp.full_like(a, 1 / len(a))),
-    "one-hot, pixel": weighed(one_hot(1)),
+    "one-hot, pixel": selected(filter=False),
     "one-hot, errors cross-bilateral": one_hot_bilateral,
     "one-hot, errors non-local means": one_hot_means,
-    "one-hot, weights filtered": one_hot_after,
+    "one-hot, weights filtered": selected(filter=True),
     "one-hot, 31x31": weighed(one_hot(31)),
-    "pixel (the paper), no filter": combined(filter=False),
-    PAPER: combined(),
+    "pixel (the paper), no filter": combined(solver="hull", filter=False),
+    PAPER: combined(solver="hull", filter=True),
+    **{
+        f"{PAPER}, {name}": combined(solver="hull", filter=ensemble.Filter(**options))
+        for name, options in {
+            "variance blurred": {"blur": 2.0},
+            "weights clipped": {"clip": 1.0},
+            "normals standardised": {"standardise": True},
+            "all three": {"blur": 2.0, "clip": 1.0, "standardise": True},
+        }.items()
+    },
     **{f"{w}x{w}": weighed(over(w)) for w in (7, 15, 31, 63)},
     "frame": weighed(over(whole_frame=True)),
     OURS: combined(solver="multi-scale", filter=False),
-    "multi-scale, filtered": combined(solver="multi-scale"),
+    "multi-scale, filtered": combined(solver="multi-scale", filter=True),
     "multi-scale, each channel": combined(
         solver="multi-scale", filter=False, shared=False
     ),

@@ -7,7 +7,7 @@ channels or [H,W,C]. Notation:
     v       variance of the mean u
     m       mean squared error of b: its variance plus its squared bias
     p       prior, a smooth image
-    eta^2   confidence: expected squared distance of the truth from p; 0 if p is exact
+    eta^2   mean squared error of p: its expected squared distance from the truth
 
     x1 = k1 b + (1 - k1) u,   k1 = v / (v + m),    with error s = v m / (v + m)
     x  = k2 p + (1 - k2) x1,  k2 = s / (s + eta^2)                           (9, 10)
@@ -17,7 +17,7 @@ favours the better of two integrators, the second removes noise that both have l
 
 The prior is a windowed regression on features, of u and b together, where the weights
 of each come from the other (`radiance_prior`). Without a network, eta^2 comes from
-`confidence`, and m from halves (`biased_error`) or from passes with different radii
+`prior_error`, and m from halves (`biased_error`) or from passes with different radii
 (`radius_bias`). `combine_frame` does all this for a frame.
 
 Source: C. Zhou et al., "DSCombiner: Double Shrinkage for Combining Estimate and
@@ -28,9 +28,9 @@ from jscomb.double_shrinkage._combine import Factors, combine, factors
 from jscomb.double_shrinkage._estimate import (
     Dependence,
     biased_error,
-    confidence,
     dependence,
     limit_prior,
+    prior_error,
     radius_bias,
     unbiased_error,
 )
@@ -47,6 +47,7 @@ from jscomb.double_shrinkage._frame import (
 from jscomb.double_shrinkage._neural import Filters, combine_inputs, neural_combine
 from jscomb.double_shrinkage._prior import blend_prior, radiance_prior
 
+
 __all__ = [
     "NEEDS",
     "Dependence",
@@ -58,7 +59,6 @@ __all__ = [
     "combine",
     "combine_frame",
     "combine_inputs",
-    "confidence",
     "dependence",
     "depends",
     "factors",
@@ -68,6 +68,7 @@ __all__ = [
     "neural_combine_frame",
     "neural_inputs",
     "plan_neural",
+    "prior_error",
     "radiance_prior",
     "radius_bias",
     "unbiased_error",

@@ -35,16 +35,17 @@ class Factors(NamedTuple):
         return self.biased * biased + (1 - self.biased) * unbiased
 
 
-def factors(variance: Errors, mse: Errors, confidence: Errors) -> Factors:
+def factors(variance: Errors, mse: Errors, prior_mse: Errors) -> Factors:
     """Return the shares of minimum expected error.
 
     Differentiable. An image whose error is 0 has a share of 1; among several the
-    unbiased one, then the biased one, then the prior.
+    unbiased one, then the biased one, then the prior. One whose error is infinite has
+    none; if all are, the unbiased one has all.
 
     Args:
         variance: v of the unbiased image, squared radiance, shape [H,W,1] or [H,W,C].
         mse: m of the biased image, same.
-        confidence: eta^2, same.
+        prior_mse: eta^2, mean squared error of the prior, same.
 
     Returns:
         the shares, of the broadcast shape.
@@ -60,11 +61,21 @@ def factors(variance: Errors, mse: Errors, confidence: Errors) -> Factors:
 
     Source: DSC eq. 10.
     """
-    check_not_negative(variance=variance, mse=mse, confidence=confidence)
-    v, m, eta = jnp.broadcast_arrays(variance, mse, confidence)
-    # Not v m / (v + m): that product leaves the range of float32 for dark images.
-    error = v * weighted_ratio(m, v + m)
-    return Factors(weighted_ratio(v, v + m), weighted_ratio(error, error + eta), error)
+    check_not_negative(variance=variance, mse=mse, prior_mse=prior_mse)
+    v, m, eta = jnp.broadcast_arrays(variance, mse, prior_mse)
+    of_biased, error = _blended(v, m)
+    of_prior, _ = _blended(error, eta)
+    return Factors(of_biased, of_prior, error)
+
+
+def _blended(error: Errors, other: Errors) -> tuple[Errors, Errors]:
+    """The other image's share of the best blend of two, and the blend's error."""
+    lost, useless = jnp.isposinf(error), jnp.isposinf(other)
+    e, o = jnp.where(lost, 1.0, error), jnp.where(useless, 1.0, other)
+    share = jnp.where(lost, 1.0, weighted_ratio(e, e + o))
+    # Not e o / (e + o): that product leaves the range of float32 for dark images.
+    blend = jnp.where(lost, other, e * weighted_ratio(o, e + o))
+    return jnp.where(useless, 0.0, share), jnp.where(useless, error, blend)
 
 
 def combine(
@@ -73,7 +84,7 @@ def combine(
     biased: Image,
     variance: Errors,
     mse: Errors,
-    confidence: Errors,
+    prior_mse: Errors,
 ) -> Image:
     """Blend two integrators, and the result with a prior, weighted by their errors.
 
@@ -84,8 +95,9 @@ def combine(
         unbiased: u, linear radiance, shape [H,W,C].
         biased: b, linear radiance, shape [H,W,C].
         variance: v of the mean u, squared radiance, shape [H,W,1] or [H,W,C].
-        mse: m, mean squared error of b, same.
-        confidence: eta^2, same; 0 gives the prior, infinity the blend of u and b.
+        mse: m, mean squared error of b, same; infinity gives b no share.
+        prior_mse: eta^2, mean squared error of the prior, same; 0 gives the prior,
+            infinity the blend of u and b.
 
     Returns:
         the blend, linear radiance, shape [H,W,C]; at an invalid pixel the first finite
@@ -104,7 +116,7 @@ def combine(
     Source: DSC eq. 9.
     """
     check_same_shape(unbiased=unbiased, biased=biased, prior=prior)
-    named = {"variance": variance, "mse": mse, "confidence": confidence}
+    named = {"variance": variance, "mse": mse, "prior_mse": prior_mse}
     shapes = [(*unbiased.shape[:2], c) for c in (1, unbiased.shape[2])]
     for name, errors in named.items():
         if getattr(errors, "shape", None) not in shapes:
@@ -112,12 +124,9 @@ def combine(
             raise ValueError(
                 f"{name} must have shape {shapes[0]} or {shapes[1]}: {got}"
             )
-    no_prior = jnp.isposinf(confidence)
-    known = jnp.where(no_prior, 0.0, confidence)
-    valid, p, u, b, v, m, eta = zero_invalid(
-        prior, unbiased, biased, variance, mse, known
-    )
-    share = factors(v, m, eta)
-    k2 = jnp.where(no_prior, 0.0, share.prior)
-    image = k2 * p + (1 - k2) * share.blend(u, b)
+    known = [jnp.where(jnp.isposinf(e), 0.0, e) for e in named.values()]
+    valid, p, u, b, *known = zero_invalid(prior, unbiased, biased, *known)
+    pairs = zip(named.values(), known, strict=True)
+    share = factors(*(jnp.where(jnp.isposinf(e), e, k) for e, k in pairs))
+    image = share.prior * p + (1 - share.prior) * share.blend(u, b)
     return jnp.where(valid, image, first_finite(biased, unbiased))

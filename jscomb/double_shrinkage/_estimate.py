@@ -168,7 +168,7 @@ def radius_bias(
     return jnp.square(typical * _pooled(slope, level, level, window))
 
 
-def confidence(
+def prior_error(
     prior: Image,
     unbiased: Image,
     biased: Image,
@@ -200,7 +200,7 @@ def confidence(
 
     Example:
         >>> at = lambda value: jnp.full((1, 1, 1), value)
-        >>> eta = confidence(at(1.0), at(3.0), at(3.0), at(2.0), at(2.0))
+        >>> eta = prior_error(at(1.0), at(3.0), at(3.0), at(2.0), at(2.0))
         >>> print(f"{eta.item():.3f}")  # (3 - 1)^2 - 2 * 2 / (2 + 2)
         3.000
 

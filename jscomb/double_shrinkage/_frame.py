@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 from jscomb.double_shrinkage._combine import combine, factors
 from jscomb.double_shrinkage._estimate import (
     biased_error,
-    confidence,
     dependence,
     limit_prior,
+    prior_error,
     unbiased_error,
 )
 from jscomb.double_shrinkage._neural import Network, combine_inputs
@@ -43,7 +43,7 @@ class Inputs(NamedTuple):
         biased: b, normalised radiance, [H,W,C].
         variance: v, estimated variance of u, [H,W,C].
         mse: m, estimated mean squared error of b, [H,W,C].
-        confidence: eta^2, [H,W,C].
+        prior_mse: eta^2, estimated mean squared error of p, [H,W,C].
     """
 
     prior: Image
@@ -51,7 +51,7 @@ class Inputs(NamedTuple):
     biased: Image
     variance: Image
     mse: Image
-    confidence: Image
+    prior_mse: Image
 
 
 def combine_frame(
@@ -89,7 +89,7 @@ def combine_frame(
         0.200
         0.114
 
-    Source: DSC, with `confidence` and `biased_error` in place of its network, and the
+    Source: DSC, with `prior_error` and `biased_error` in place of its network, and the
     prior of the first blend.
     """
     frame.require(_NAME, NEEDS)
@@ -174,7 +174,7 @@ def _estimated(
         ridge=ridge,
     )
     p = limit_prior(p, u, b, v)
-    return p, v, m, confidence(p, u, b, v, m)
+    return p, v, m, prior_error(p, u, b, v, m)
 
 
 def _over_channels(errors: Image) -> Float[Array, "h w 1"]:
@@ -194,8 +194,8 @@ def neural_inputs(
         stride: pixels between their centres.
 
     Returns:
-        prior, unbiased and biased, [H,W,C]; variance and mse, means over channels,
-        [H,W,1].
+        prior, unbiased and biased, [H,W,C]; variance (`unbiased_error`) and mse
+        (`biased_error`), means over channels, [H,W,1].
 
     Example:
         >>> from jscomb.frame import make_frame

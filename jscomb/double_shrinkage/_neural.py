@@ -1,4 +1,4 @@
-"""Double shrinkage with errors that a network pools, and its confidence."""
+"""Double shrinkage with errors that a network pools, and its error of the prior."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -20,11 +20,11 @@ class Filters(NamedTuple):
 
     Attributes:
         kernels: weights of v and of m in each pixel's window, 2 w² a pixel.
-        confidence: eta^2, squared radiance, at least zero, [H,W,1].
+        prior_mse: eta^2, squared radiance, at least zero, [H,W,1].
     """
 
     kernels: Kernels
-    confidence: Error
+    prior_mse: Error
 
 
 Network = Callable[[Image, Image, Image, Error, Error], Filters]
@@ -50,8 +50,10 @@ def neural_combine(
         prior: p, linear radiance, shape [H,W,C].
         unbiased: u, linear radiance, shape [H,W,C].
         biased: b, linear radiance, shape [H,W,C].
-        variance: sample variance v of the mean u, mean over channels, squared radiance,
-            at least zero, shape [H,W,1].
+        variance: v of the mean u, estimated as the network's was in training, mean over
+            channels, squared radiance, at least zero, shape [H,W,1]. The paper's is a
+            sample variance; `neural_inputs` pools half of it (`unbiased_error`), and so
+            the trained networks know it.
         mse: m of b, same.
 
     Returns:

@@ -33,7 +33,8 @@ def radiance_prior(
         unbiased: u, normalised radiance, shape [H,W,C].
         biased: b, normalised radiance, shape [H,W,C].
         variance: v of u, mean over channels, at least zero, shape [H,W,1].
-        mse: m of b, mean over channels, at least zero, shape [H,W,1].
+        mse: of b, mean over channels, at least zero, shape [H,W,1]: m, or as in the
+            paper b's variance alone, for narrower weights where b is biased.
         features: range of about one, shape [H,W,F]; F may be 0.
         window: width of the windows in pixels, odd.
         stride: pixels between the centres of windows.
@@ -54,8 +55,9 @@ def radiance_prior(
         >>> print(jnp.abs(p - (u + b) / 2).max().round(3))
         0.0
 
-    Source: DSC eq. 11-17, with f_i - f_j for the printed f_j - f_i in eq. 17, and a
-    mean where it prints a sum.
+    Source: DSC eq. 11-17. Ours are f_i - f_j for the printed f_j - f_i in eq. 17, a
+    mean where it prints a sum, features divided by their range in the window, and a
+    ridge of the slopes alone, where the paper adds an epsilon to the whole diagonal.
     """
     check_same_shape(unbiased=unbiased, biased=biased)
     one = (*unbiased.shape[:2], 1)

@@ -25,6 +25,10 @@ are local, with few there is almost one weight a base for the frame. A pixel who
 buffer is noisy has less weight in these means; weights vary slowly, so they are solved
 for in blocks of 4x4 pixels and interpolated.
 
+The paper's figure 7 has slightly less error with weights of each channel than with one
+weight a base (there of single pixels); multi-scale weights are one by default, since
+`<M>` averaged over channels is less noisy, and of each channel with `shared=False`.
+
 Consistent if one base is: its error vanishes as samples grow, and so does the minimum.
 
 A network can correct these weights pixel by pixel (`neural_combine`): it sees the
@@ -43,12 +47,17 @@ Sources:
 from jscomb.ensemble._combine import (
     average,
     combine,
-    filter_weights,
     one_hot,
     solve_weights,
     spread,
 )
-from jscomb.ensemble._estimate import error_matrix, mse_matrix, true_matrix
+from jscomb.ensemble._estimate import (
+    error_matrix,
+    mse_matrix,
+    selection_errors,
+    true_matrix,
+)
+from jscomb.ensemble._filter import Filter, filter_weights
 from jscomb.ensemble._frame import (
     NEEDS,
     Stacked,
@@ -73,6 +82,7 @@ __all__ = [
     "NEEDS",
     "NEURAL_NEEDS",
     "Candidates",
+    "Filter",
     "Selected",
     "Stacked",
     "average",
@@ -90,6 +100,7 @@ __all__ = [
     "one_hot",
     "plan_neural_weights",
     "select_bases",
+    "selection_errors",
     "solve_weights",
     "spread",
     "stack_estimates",

@@ -8,17 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.ensemble._estimate import SCALES, error_matrix
+from jscomb.ensemble._estimate import SCALES, error_matrix, selection_errors
 from jscomb.ensemble._evidence import Bases, check_bases
+from jscomb.ensemble._filter import Filter, Guide, filter_weights
 from jscomb.numerics import simplex
-from jscomb.numerics.guards import check_same_shape, first_finite, zero_invalid
-from jscomb.numerics.weights import bilateral_weights, weighted_mean
+from jscomb.numerics.guards import first_finite, zero_invalid
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Key, Variance
 
-Guide = Float[Array, "h w _"]
 Blocks = Float[Array, "n rows columns _"]
-Solver = Literal["hull", "iterative", "reference", "multi-scale"]
+Solver = Literal["multi-scale", "hull", "iterative", "reference", "one-hot"]
 _SMOOTH = 2.0  # standard deviation, in blocks, of the filter of multi-scale weights
 
 
@@ -29,8 +28,8 @@ def combine(
     unbiased_a: Image,
     unbiased_b: Image,
     *,
-    solver: Solver = "hull",
-    filter: bool = True,
+    solver: Solver = "multi-scale",
+    filter: bool | Filter = False,
     albedo: Guide | None = None,
     normal: Guide | None = None,
     solver_key: Key | None = None,
@@ -43,8 +42,8 @@ def combine(
     """Combine any number of bases by the weights of minimum estimated error.
 
     Pure, scale-equivariant, and differentiable in every array with the exact solvers.
-    The default is the paper's method; `solver="multi-scale", filter=False` measures
-    better, and most often better than the best base.
+    The paper's method is `solver="hull", filter=True`, its comparison with a selection
+    of one base a pixel (section 5.2.6) `solver="one-hot", filter=True`.
 
     Args:
         biased: y, each base of the full frame, radiance, shape [N,H,W,C]. The unbiased
@@ -54,12 +53,14 @@ def combine(
         unbiased_a: x_a, shape [H,W,C].
         unbiased_b: x_b, same shape.
         solver: see `solve_weights`.
-        filter: smooth the weights by `filter_weights`.
+        filter: smooth the weights by `filter_weights`, guided by the ensemble with the
+            weights as they are; a `Filter` has other options than the paper's.
         albedo: guide of the filter, shape [H,W,3]; optional, as is the normal.
         normal: guide of the filter, shape [H,W,3].
         solver_key: of the iterative solver, a typed key.
-        variance_a: of "multi-scale", of x_a, see `error_matrix`; shape [H,W,C].
-        variance_b: of "multi-scale", of x_b, same shape.
+        variance_a: of x_a, shape [H,W,C]; "one-hot" needs it, and "multi-scale" takes
+            it as `error_matrix` does.
+        variance_b: of x_b, same shape.
         windows: of "multi-scale".
         shared: of "multi-scale", one weight for all channels.
         block: of "multi-scale", width in pixels of the blocks whose weights are solved
@@ -76,10 +77,10 @@ def combine(
     Example:
         >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
         >>> y, x = at(1.0, 4.0), at(2.0)[0]
-        >>> print(combine(y, y, y, x, x, filter=False)[0, 0].round(3))
+        >>> print(combine(y, y, y, x, x)[0, 0].round(3))
         [2.]
 
-    Source: ED section 4.
+    Source: ED section 4; the multi-scale weights are ours.
     """
     weights = filtered_weights(
         biased,
@@ -108,7 +109,7 @@ def filtered_weights(
     unbiased_a: Image,
     unbiased_b: Image,
     *,
-    filter: bool,
+    filter: bool | Filter,
     albedo: Guide | None,
     normal: Guide | None,
     **options: Any,
@@ -121,7 +122,10 @@ def filtered_weights(
         return weights
     z, z_a, z_b = (average(y, weights) for y in (biased, biased_a, biased_b))
     noise = jnp.square(z_a - z_b) / 2
-    return filter_weights(weights, z, noise, albedo=albedo, normal=normal)
+    how = filter if isinstance(filter, Filter) else Filter()
+    return filter_weights(
+        weights, z, noise, albedo=albedo, normal=normal, **how._asdict()
+    )
 
 
 def solve_weights(
@@ -130,7 +134,7 @@ def solve_weights(
     unbiased_a: Image,
     unbiased_b: Image,
     *,
-    solver: Solver = "hull",
+    solver: Solver = "multi-scale",
     solver_key: Key | None = None,
     variance_a: Variance | None = None,
     variance_b: Variance | None = None,
@@ -145,12 +149,14 @@ def solve_weights(
         biased_b: y^b, made from half b.
         unbiased_a: x_a, shape [H,W,C].
         unbiased_b: x_b, same shape.
-        solver: "hull", the paper's objective of single pixels and channels, exactly;
-            "iterative" and "reference", the same by the paper's solver and by jaxopt;
-            "multi-scale", ours: `quadratic` on `error_matrix`.
+        solver: "multi-scale", ours: `quadratic` on `error_matrix`; "hull", the paper's
+            objective of single pixels and channels, exactly; "iterative" and
+            "reference", the same by the paper's solver and by jaxopt; "one-hot", the
+            base of minimum `selection_errors`.
         solver_key: of the iterative solver, a typed key.
-        variance_a: of "multi-scale", of x_a, see `error_matrix`; shape [H,W,C].
-        variance_b: of "multi-scale", of x_b, same shape.
+        variance_a: of x_a, shape [H,W,C]; "one-hot" needs it, and "multi-scale" takes
+            it as `error_matrix` does.
+        variance_b: of x_b, same shape.
         windows: of "multi-scale".
         shared: of "multi-scale", one weight for all channels.
         block: of "multi-scale", width in pixels of the blocks whose weights are solved
@@ -162,12 +168,13 @@ def solve_weights(
 
     Raises:
         ValueError: while tracing, if shapes differ, there is no base, the solver is
-            unknown, or lacks its key.
+            unknown, or lacks its key or variances.
 
     Example:
         >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
         >>> y, x = at(1.0, 4.0), at(2.0)[0]
-        >>> print([f"{share:.3f}" for share in solve_weights(y, y, x, x).ravel()])
+        >>> weights = solve_weights(y, y, x, x, solver="hull")
+        >>> print([f"{share:.3f}" for share in weights.ravel()])
         ['0.667', '0.333']
 
     Source: ED eq. 13, 14.
@@ -189,6 +196,10 @@ def solve_weights(
     _, *clean = zero_invalid(*images)
     if solver == "hull":
         return simplex.hull(*clean)
+    if solver == "one-hot":
+        if variance_a is None or variance_b is None:
+            raise ValueError("the one-hot solver needs variance_a and variance_b")
+        return one_hot(selection_errors(*images, variance_a, variance_b))
     if solver == "reference":
         return simplex.reference(*clean)
     if solver != "iterative":
@@ -224,8 +235,8 @@ def one_hot(errors: Bases) -> Bases:
     """Return weights that select the base of minimum error.
 
     Args:
-        errors: of each base at each pixel, for example the diagonal of `mse_matrix`,
-            filtered or not, shape [N,H,W,C].
+        errors: of each base at each pixel, for example `selection_errors`, filtered or
+            not, shape [N,H,W,C].
 
     Returns:
         1 for the base of minimum error, the first of equals, else 0, shape [N,H,W,C].
@@ -235,74 +246,10 @@ def one_hot(errors: Bases) -> Bases:
         >>> print(one_hot(errors).ravel())
         [0. 1. 0.]
 
-    Source: ED eq. 36, 37.
+    Source: ED section 5.2.6.
     """
     best = jnp.argmin(errors, axis=0)
     return jax.nn.one_hot(best, len(errors), axis=0, dtype=errors.dtype)
-
-
-def filter_weights(
-    weights: Bases,
-    combined: Image,
-    variance: Variance,
-    *,
-    albedo: Guide | None = None,
-    normal: Guide | None = None,
-    radius: int = 7,
-    sigma: float = 3.0,
-    sigma_radiance: float = 2.0,
-    sigma_albedo: float = 0.25,
-    sigma_normal: float = 0.15,
-) -> Bases:
-    """Smooth weights where image and features are smooth.
-
-    Args:
-        weights: of the bases, shape [N,H,W,C].
-        combined: z, the ensemble with these weights, radiance, shape [H,W,C].
-        variance: of z, squared radiance, shape [H,W,C].
-        albedo: shape [H,W,3]; optional, as is the normal.
-        normal: shape [H,W,3].
-        radius: of the windows, in pixels.
-        sigma: standard deviation of the distance, in pixels.
-        sigma_radiance: of z, in units of its noise.
-        sigma_albedo: of the albedo.
-        sigma_normal: of the normal.
-
-    Returns:
-        the filtered weights, shape [N,H,W,C]; unchanged at pixels that are not finite
-        in some guide.
-
-    Raises:
-        ValueError: while tracing, if shapes differ or `sigma` is not positive.
-
-    Example:
-        >>> row = lambda *values: jnp.tile(jnp.array(values)[None, :, None], 3)
-        >>> w, edge = row(0.0, 0.4, 0.6, 1.0), row(0.0, 0.0, 1.0, 1.0)
-        >>> z = jnp.ones_like(w)
-        >>> found = filter_weights(w[None], z, z, albedo=edge, radius=1, sigma=100.0)
-        >>> print([f"{share:.2f}" for share in found[0, 0, :, 0]])
-        ['0.20', '0.20', '0.80', '0.80']
-
-    Source: ED eq. 32-34, with the constants of section 4.2.
-    """
-    n, h, w, c = weights.shape
-    check_same_shape(combined=combined, variance=variance)
-    scaled = [
-        image / (2**0.5 * s)
-        for image, s in ((albedo, sigma_albedo), (normal, sigma_normal))
-        if image is not None
-    ]
-    for name, image in (("weights", weights[0]), *(("a guide", i) for i in scaled)):
-        if image.shape[:2] != combined.shape[:2]:
-            raise ValueError(f"{name} has {image.shape}, combined {combined.shape}")
-    none = jnp.zeros((h, w, 0), combined.dtype)
-    guide = jnp.concatenate([none, *scaled], axis=-1)
-    flat = jnp.moveaxis(weights, 0, 2).reshape(h, w, n * c)
-    alike = bilateral_weights(
-        guide, combined / (2**0.5 * sigma_radiance), variance, sigma=sigma
-    )
-    filtered = weighted_mean(flat, alike, window=2 * radius + 1)
-    return jnp.moveaxis(filtered.reshape(h, w, n, c), 2, 0)
 
 
 def average(biased: Bases, weights: Bases) -> Image:

@@ -15,7 +15,7 @@ from jscomb.ensemble._evidence import (
     pooled,
     unpacked,
 )
-from jscomb.numerics.guards import divide, safe_sqrt
+from jscomb.numerics.guards import check_same_shape, divide, safe_sqrt
 from jscomb.typing import Image, Variance
 
 SCALES = 29, 61
@@ -55,6 +55,50 @@ def mse_matrix(
         return pairs + product[None, None]
 
     return (one(biased_a, unbiased_b) + one(biased_b, unbiased_a)) / 2
+
+
+def selection_errors(
+    biased_a: Bases,
+    biased_b: Bases,
+    unbiased_a: Image,
+    unbiased_b: Image,
+    variance_a: Variance,
+    variance_b: Variance,
+) -> Bases:
+    """Estimate the error of each base of the full frame, to select one a pixel by.
+
+    MSE[y_i^a] = (y_i^a - x_b)^2 - v_b, and that of half b; of the full frame their mean
+    less Var[y_i]. The halves' difference has four times the variance of their mean, so
+    that Var[y_i] = (y_i^a - y_i^b)^2 / 4.
+
+    Args:
+        biased_a: y^a, each base made from half a, radiance, shape [N,H,W,C].
+        biased_b: y^b, made from half b.
+        unbiased_a: x_a, shape [H,W,C].
+        unbiased_b: x_b, same shape.
+        variance_a: of the mean x_a, squared radiance, same shape.
+        variance_b: of x_b, same shape.
+
+    Returns:
+        the errors, squared radiance, noisy, of either sign, shape [N,H,W,C].
+
+    Raises:
+        ValueError: while tracing, if shapes differ or there is no base.
+
+    Example:
+        >>> at = lambda *values: jnp.array(values).reshape(-1, 1, 1, 1)
+        >>> y_a, y_b, x, v = at(1.0, 3.5), at(2.0, 3.5), at(2.0)[0], at(0.25)[0]
+        >>> print(selection_errors(y_a, y_b, x, x, v, v).ravel())
+        [0. 2.]
+
+    Source: ED eq. 36, 37.
+    """
+    check_bases(biased_a, biased_b, unbiased_a, unbiased_b)
+    check_same_shape(unbiased_a=unbiased_a, variance_a=variance_a)
+    check_same_shape(unbiased_a=unbiased_a, variance_b=variance_b)
+    of_a = jnp.square(biased_a - unbiased_b[None]) - variance_b[None]
+    of_b = jnp.square(biased_b - unbiased_a[None]) - variance_a[None]
+    return (of_a + of_b) / 2 - jnp.square(biased_a - biased_b) / 4
 
 
 def true_matrix(biased: Float[Array, "s n h w c"], truth: Image) -> Matrix:

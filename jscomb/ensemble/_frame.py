@@ -9,6 +9,7 @@ import numpy as np
 from jscomb.ensemble._combine import Solver, average, filtered_weights
 from jscomb.ensemble._estimate import SCALES
 from jscomb.ensemble._evidence import Bases
+from jscomb.ensemble._filter import Filter
 from jscomb.ensemble._selection import select_bases
 from jscomb.frame import (
     Estimate,
@@ -85,7 +86,7 @@ def combine_frame(
     estimates: Mapping[str, Estimate | Maker],
     *,
     solver: Solver = "multi-scale",
-    filter: bool = False,
+    filter: bool | Filter = False,
     select: bool = False,
     solver_key: Key | None = None,
     windows: Sequence[int] = SCALES,
@@ -101,7 +102,8 @@ def combine_frame(
             result are independent: each has weights of its own, from quarters.
             Otherwise both halves share the weights of the full frame.
         solver: see `solve_weights`.
-        filter: smooth the weights by `filter_weights`, guided by the frame's features.
+        filter: smooth the weights by `filter_weights`, guided by the frame's features;
+            a `Filter` has other options than the paper's.
         select: drop the estimates that do not lower the error (`select_bases`); decides
             on values, so not for `jit`.
         solver_key: of the iterative solver, a typed key.

@@ -21,6 +21,8 @@ of the difference; every pixel takes the mean share of all windows that contain 
 For p >= 3, Gaussian noise and a y that does not depend on x, each window's result has
 a lower expected squared error than x, whatever y is: summed over the window for equal
 variances, and in units of the variance for the whitened rule, which needs no equality.
+In plain squared error the whitened rule can be worse than x under unequal variances:
+where y is off at the one noisy pixel of a window, all its pixels say that y is right.
 A denoised y does depend on x, and path-traced noise is not Gaussian, so in practice
 neither is a guarantee: at low sample counts a good denoiser alone is often better.
 The divergence of the denoiser, D_i = (J Sigma)_ii, corrects for the dependence:

@@ -43,7 +43,8 @@ def combine(
             checked). Without `whiten` the value at c is s2_c, the variance of c's
             window; with it, v_i of each pixel.
         window: width of the windows in pixels, odd, at least three.
-        whiten: allow each pixel its own variance within a window.
+        whiten: allow each pixel its own variance within a window. The expected error is
+            then lower than that of x in units of the variance, not always as it is.
         divergence: D, the covariance of y with x, squared radiance, shape [H,W,C]:
             `numerics.sure.monte_carlo_sure(...).divergence` of the denoiser that made
             y, with this variance. None: y does not depend on x.

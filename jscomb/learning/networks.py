@@ -53,7 +53,7 @@ Serves = Literal["denoised", "independent", "any"]
 
 _MIXING_WIDTH = {"full": 48, "light": 24}
 _MINIMUM_WEIGHT = 1e-4  # NJS adds it to its weights
-_MAXIMUM_EXPONENT = 30.0  # of a confidence; beyond it the prior has no weight
+_MAXIMUM_EXPONENT = 30.0  # of eta²; beyond it the prior has no weight
 _VARIANCE_UNIT = 0.01  # squared normalised radiance
 _SQUARE_UNIT = 1e-4  # squared relative error
 _PAPER = Rule()
@@ -111,16 +111,16 @@ class ShrinkageNetwork(Headed):
     Attributes:
         body: U-Net.
         kernels: projection to two kernels.
-        confidence: projection to the logarithm of eta².
+        prior_mse: projection to the logarithm of eta².
         window: width of the kernels in pixels.
         serves: biased images that it was trained on: denoised, independent (of another
             integrator), or any.
 
     Example:
         >>> network = ShrinkageNetwork(jax.random.key(0), size="light")
-        >>> confidence = lambda x, v: network(x, x, x, v, v).confidence
+        >>> prior_mse = lambda x, v: network(x, x, x, v, v).prior_mse
         >>> x, v = jnp.ones((6, 4, 3)), jnp.ones((6, 4, 1))
-        >>> print(jax.eval_shape(confidence, x, v).shape)
+        >>> print(jax.eval_shape(prior_mse, x, v).shape)
         (6, 4, 1)
 
     Source: DSC section 4.3.
@@ -130,13 +130,13 @@ class ShrinkageNetwork(Headed):
         self, key: Key, *, window: int = 13, size: Size = "full", serves: Serves = "any"
     ):
         """Draw all convolutions."""
-        body, kernels, confidence = jax.random.split(key, 3)
+        body, kernels, prior_mse = jax.random.split(key, 3)
         width = WIDTHS[size][0]
         self.body = UNet(body, 11, size=size)
         self.window, self.serves = window, serves
         weights = 2 * check_window(window) ** 2
         self.kernels = Convolution(kernels, width, weights, size=1)
-        self.confidence = Convolution(confidence, width, 1, size=1)
+        self.prior_mse = Convolution(prior_mse, width, 1, size=1)
 
     def __call__(
         self,
@@ -154,7 +154,7 @@ class ShrinkageNetwork(Headed):
         errors = [_compress_variance(e) for e in (variance, mse)]
         features = self.body(jnp.concatenate([*radiance, *errors], axis=-1))
         exponent = jnp.clip(
-            self.confidence(features), -_MAXIMUM_EXPONENT, _MAXIMUM_EXPONENT
+            self.prior_mse(features), -_MAXIMUM_EXPONENT, _MAXIMUM_EXPONENT
         )
         head = lambda f: _softmax(self.kernels(f), parts=2)
         kernels = Kernels(features, head, self.kernels.reach, self.window)

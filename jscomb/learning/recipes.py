@@ -245,10 +245,10 @@ def _james_stein_without(inputs: Mapping[str, Image]) -> Image:
 
 
 def _double_shrinkage_without(inputs: Mapping[str, Image]) -> Image:
-    """With the errors as they are, and the confidence that they give."""
+    """With the errors as they are, and the prior's error that they give."""
     p, u, b = (inputs[name] for name in ("prior", "unbiased", "biased"))
     v, m = (jnp.broadcast_to(inputs[name], u.shape) for name in ("variance", "mse"))
-    eta = double_shrinkage.confidence(p, u, b, v, m)
+    eta = double_shrinkage.prior_error(p, u, b, v, m)
     return double_shrinkage.combine(p, u, b, v, m, eta)
 
 

@@ -38,7 +38,7 @@ def combine(
 
     Returns:
         the estimate, in the frame's unit. Its halves are None where they cannot be
-        made: `METHODS[method].needs.missing_for_halves(frame)` returns the reason. With
+        made: `METHODS[method].missing_for_halves(frame)` returns the reason. With
         two sub-buffers, and in a tier, the halves of an ensemble share its weights.
 
     Raises:

@@ -61,12 +61,21 @@ def inputs(
 
 def _unfit(name: str, frame: Frame) -> str:
     """Why a method cannot make an estimate with halves; empty if it can."""
-    missing = METHODS[name].needs.missing_for_halves(frame)
-    if not missing and METHODS[name].takes == "one estimate":
-        held = frame.estimates.get(_DENOISER)
+    method = METHODS[name]
+    missing = method.missing_for_halves(frame)
+    if not missing and method.takes == "one estimate":
+        wanted = method.input or _DENOISER
+        held = frame.estimates.get(wanted)
         if held is None or held.halves is None:
-            missing = METHODS[_DENOISER].needs.missing_for_halves(frame)
+            missing = _missing_input(wanted, frame)
     return f"needs {missing}" if missing else ""
+
+
+def _missing_input(name: str, frame: Frame) -> str:
+    """What is missing of an estimate that has no halves; empty if it can be made."""
+    if name in METHODS:
+        return METHODS[name].missing_for_halves(frame)
+    return f"an estimate {name!r} with halves: frame.with_estimate({name!r}, ...)"
 
 
 def given_to(
@@ -87,6 +96,10 @@ def given_to(
             raise ValueError(f"{method} has no bases: {_listed(skipped)}")
         frame = with_inputs(key, frame, names)
         return frame, ({name: _maker(key, frame, name) for name in names},)
+    if biased is None and chosen.input is not None:
+        if chosen.input not in frame.estimates:
+            raise ValueError(f"{method} needs {_missing_input(chosen.input, frame)}")
+        biased = chosen.input
     name = input_name(frame, biased=biased)
     frame = with_input(key, frame, name)
     if not chosen.needs.halves and frame.estimates[name].halves is not None:
@@ -157,7 +170,7 @@ def with_input(key: Key, frame: Frame, name: str) -> Frame:
             f"{name} takes several estimates itself: make it first, and add it by "
             f"frame.with_estimate({name!r}, ...)"
         )
-    frame, given = given_to(key, frame, name, taken_by(name, _DENOISER))
+    frame, given = given_to(key, frame, name, taken_by(name, method.input or _DENOISER))
     return frame.with_estimate(name, method.estimate(key, frame, *given))
 
 
@@ -214,7 +227,9 @@ def _maker(key: Key, frame: Frame, name: str) -> Estimate | Maker:
 
     def make(part: Frame) -> Estimate:
         image, halves = part.estimates[name]
-        if halves is None and not method.needs.missing_for_halves(part):
+        if halves is None and method.own_halves:
+            halves = method.estimate(key, part).halves
+        elif halves is None and not method.needs.missing_for_halves(part):
             of_halves = [method.image(key, half) for half in part.halves()]
             halves = jnp.stack(of_halves)
         return Estimate(image, halves)

@@ -6,9 +6,15 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 
-from jscomb import double_shrinkage, ensemble, james_stein, progressive
+from jscomb import (
+    double_shrinkage,
+    ensemble,
+    james_stein,
+    progressive,
+    uncorrelated,
+)
 from jscomb.denoisers import bilateral, nfor, nonlocal_means, oidn, rdfc, smoothing
-from jscomb.frame import Estimate, Frame, Needs, with_halves
+from jscomb.frame import Estimate, Frame, Needs, estimates_of, with_halves
 from jscomb.numerics.tiles import Local
 from jscomb.typing import Image, Key
 
@@ -29,6 +35,9 @@ class Method(NamedTuple):
         pure: decides on no values, for `jit` and `vmap`.
         variant: of Open Image Denoise; those of one frame are made together.
         bases: what it is made of beside the frame's own estimates, if it takes several.
+        input: name of the estimate that it takes, which no denoiser makes; None for
+            any biased image.
+        own_halves: its halves come without half frames.
     """
 
     summary: str
@@ -40,6 +49,14 @@ class Method(NamedTuple):
     pure: bool = False
     variant: oidn.Variant | None = None
     bases: tuple[str, ...] = ()
+    input: str | None = None
+    own_halves: bool = False
+
+    def missing_for_halves(self, frame: Frame) -> str:
+        """Return what a frame lacks for an estimate with halves; empty if nothing."""
+        if self.own_halves:
+            return self.needs.missing(frame)
+        return self.needs.missing_for_halves(frame)
 
     def image(self, key: Key, frame: Frame, *estimates: Any) -> Image:
         """Return the image alone, [H,W,C]."""
@@ -120,6 +137,7 @@ METHODS: dict[str, Method] = {
         nfor.NEEDS,
         "nothing",
         make=lambda key, frame: nfor.denoise_frame(frame),
+        own_halves=True,
     ),
     "bilateral": _filter("joint bilateral filter", bilateral),
     "nonlocal-means": _filter("non-local means", nonlocal_means),
@@ -188,6 +206,15 @@ METHODS: dict[str, Method] = {
             _network(_shrinkage_network(frame, y)), frame, y
         ),
     ),
+    "uncorrelated": Method(
+        "uncorrelated kernels with a rendering by common random numbers",
+        uncorrelated.NEEDS,
+        "one estimate",
+        make=lambda key, frame, z: uncorrelated.combine_frame(
+            frame, estimates_of(frame, z)
+        ),
+        input="correlated",
+    ),
     "ensemble": Method(
         "weights of minimum error for all the frame's estimates and several denoisers",
         ensemble.NEEDS,
@@ -205,8 +232,8 @@ METHODS: dict[str, Method] = {
         bases=FEW,
     ),
 }
-"""By name; the cheaper first among the combiners. Uncorrelated kernels are not here:
-they combine two renderings (`uncorrelated.combine_frame`)."""
+"""By name; the cheaper first among the combiners. Two renderings with sub-buffers are
+combined by `uncorrelated.combine_frame`, with more of the paper's kernels than here."""
 
 
 def table() -> str:

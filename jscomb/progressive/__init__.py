@@ -21,7 +21,8 @@ makes it James-Stein's rule for a y that depends on x.
 
 The bound lowers alpha where a weighted mean of z over a neighbourhood is farther from
 that of x than the noise explains. As samples grow v falls, and wherever y is biased
-alpha goes to zero: z is consistent whatever y is.
+alpha goes to zero: z is consistent whatever y is. The paper takes the channels' noise
+as independent; `channel_variance` estimates how alike it is.
 
 Source: A. Firmino, J. Frisvad, H. Jensen, "Progressive Denoising of Monte Carlo
 Rendered Images", 2022 (PD; eq. numbers above and in the functions).

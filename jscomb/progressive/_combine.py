@@ -1,6 +1,7 @@
 """The mix of a rendering and its denoised image, and the bound for consistency."""
 
 from collections.abc import Callable
+from typing import Literal, get_args
 
 import jax.numpy as jnp
 from jax.scipy.special import ndtr
@@ -17,6 +18,7 @@ from jscomb.numerics.windows import at_window_max, check_window, separable_sum
 from jscomb.progressive._estimate import mixing
 from jscomb.typing import Image, Scalar, Variance
 
+Width = Literal["relative", "absolute", "image mean"]
 Mixing = Callable[[Image, Image, Variance, Image], Image]
 
 _NARROWEST, _WIDEST = 1e-3, 100.0  # of the bound's Gaussian, in pixels
@@ -149,35 +151,54 @@ def bound_mixing(
 
 
 def bound_sigma(
-    unbiased: Image, variance: Variance, *, noise: Noise | None = None
+    unbiased: Image,
+    variance: Variance,
+    *,
+    noise: Noise | None = None,
+    width: Width = "relative",
 ) -> Scalar:
     """Return the width of the bound's Gaussian: the narrower the less noise there is.
+
+    The paper has 100 min(sqrt(Var[x-]), 1), where x- is "the image mean". That may mean
+    the mean of the pixels' variances, or the variance of the mean of all pixels, which
+    is so small that a pixel's own mean is all that is tested.
 
     Args:
         unbiased: x, linear radiance, shape [H,W,C].
         variance: v of the mean x, squared radiance, at least zero, shape [H,W,C].
         noise: as for `bound_mixing`.
+        width: "absolute", by the mean of the pixels' variances, in squared normalised
+            radiance; "relative", ours, the same relative to the mean radiance, and so
+            for images in any unit; "image mean", by the variance of the image's mean.
 
     Returns:
-        100 times the relative deviation of the frame, in pixels, from 0.001 to 100.
+        the width, from 0.001 to 100 pixels.
 
     Raises:
-        ValueError: while tracing, if shapes differ.
+        ValueError: while tracing, if shapes differ or the width is unknown.
 
     Example:
-        >>> x = jnp.ones((2, 2, 3))
-        >>> print(bound_sigma(x, 3e-4 * x).round(3))
+        >>> x = jnp.full((2, 2, 3), 2.0)
+        >>> for width in ("relative", "absolute", "image mean"):
+        ...     print(bound_sigma(x, 1.5e-4 * x, width=width).round(3))
+        0.5
         1.0
+        0.5
 
-    Source: PD eq. 15. The width there is absolute; here it is relative to the mean
-    radiance, which is the same for normalised images.
+    Source: PD eq. 15.
     """
     check_same_shape(unbiased=unbiased, variance=variance)
+    if width not in get_args(Width):
+        raise ValueError(f"width must be one of {get_args(Width)}, got {width!r}")
     valid, x, v = zero_invalid(unbiased, variance)
     noise = _of_mean(v) if noise is None else jnp.where(valid, noise, 0.0)
     count = jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
-    radiance = jnp.sum(jnp.abs(jnp.mean(x, axis=-1))) / count
-    square = divide(jnp.sum(noise) / count, jnp.square(radiance), where=radiance > 0)
+    square = jnp.sum(noise) / count
+    if width == "image mean":
+        square = square / count
+    if width == "relative":
+        radiance = jnp.sum(jnp.abs(jnp.mean(x, axis=-1))) / count
+        square = divide(square, jnp.square(radiance), where=radiance > 0)
     return jnp.clip(_WIDEST * safe_sqrt(square), _NARROWEST, _WIDEST)
 
 

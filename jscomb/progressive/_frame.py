@@ -10,16 +10,24 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jscomb.frame import Estimate, Frame, Needs, with_halves
+from jscomb.numerics.guards import safe_sqrt
 from jscomb.numerics.sure import monte_carlo_sure
 from jscomb.numerics.tiles import Local, compiled, network_plan
 from jscomb.numerics.variances import robust_variance
 from jscomb.numerics.windows import reach_of
-from jscomb.progressive._combine import BOUND_WINDOW, bound_sigma, combine
+from jscomb.progressive._combine import (
+    BOUND_WINDOW,
+    Noise,
+    Width,
+    bound_sigma,
+    combine,
+)
 from jscomb.progressive._estimate import channel_variance, mixing
 from jscomb.progressive._neural import Network, combine_inputs
-from jscomb.typing import Image, Key
+from jscomb.typing import Image, Key, Variance
 
 Denoise = Callable[[Image, Frame], Any]
 
@@ -29,7 +37,12 @@ NEEDS = Needs(variance=True, normalised=True)
 
 
 def combine_frame(
-    key: Key, denoise: Denoise, frame: Frame, *, bound: bool = True
+    key: Key,
+    denoise: Denoise,
+    frame: Frame,
+    *,
+    bound: bool = True,
+    width: Width = "relative",
 ) -> Estimate:
     """Denoise a frame, and mix by SURE without a network, whitened.
 
@@ -38,6 +51,7 @@ def combine_frame(
         denoise: denoiser of a colour and its frame.
         frame: normalised, with variance.
         bound: lower the mixing where it is not consistent with the noise.
+        width: of the bound, as for `bound_sigma`.
 
     Returns:
         the mix, normalised radiance.
@@ -58,19 +72,27 @@ def combine_frame(
     Source: PD eq. 9-18.
     """
     frame.require("progressive", NEEDS)
-    mix = compiled(_mix, bound=bound)
+    mix = compiled(_mix, bound=bound, width=width)
     inputs = lambda part: neural_inputs(jax.random.clone(key), denoise, part)
     make = lambda part: mix(inputs(part))
     return with_halves(frame, make, needs=NEEDS)
 
 
-def _mix(inputs: Mapping[str, Image], *, bound: bool) -> Image:
+def _mix(inputs: Mapping[str, Image], *, bound: bool, width: Width) -> Image:
     """Mix by whitened windows."""
-    return combine(**inputs, mix=functools.partial(mixing, whiten=True), bound=bound)
+    x, v, noise = (inputs[name] for name in ("unbiased", "variance", "noise"))
+    sigma = bound_sigma(x, v, noise=noise, width=width)
+    mix = functools.partial(mixing, whiten=True)
+    return combine(**inputs, mix=mix, bound=bound, sigma=sigma)
 
 
 def neural_combine_frame(
-    key: Key, denoise: Denoise, network: Network, frame: Frame
+    key: Key,
+    denoise: Denoise,
+    network: Network,
+    frame: Frame,
+    *,
+    width: Width = "relative",
 ) -> Estimate:
     """Denoise a frame, and mix by a network's alpha.
 
@@ -79,6 +101,7 @@ def neural_combine_frame(
         denoise: denoiser of a colour and its frame.
         network: such as `learning.networks.MixingNetwork`.
         frame: normalised, with variance.
+        width: of the bound, as for `bound_sigma`.
 
     Returns:
         the mix, normalised radiance.
@@ -100,12 +123,21 @@ def neural_combine_frame(
     Source: PD eq. 11-19; alpha in the form that the network was trained for.
     """
     frame.require("pd", NEEDS)
-    plan = lambda part: plan_neural(jax.random.clone(key), denoise, network, part)
+    plan = lambda part: plan_neural(
+        jax.random.clone(key), denoise, network, part, width=width
+    )
     make = lambda part: plan(part).whole()
     return with_halves(frame, make, needs=NEEDS)
 
 
-def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> Local:
+def plan_neural(
+    key: Key,
+    denoise: Denoise,
+    network: Network,
+    frame: Frame,
+    *,
+    width: Width = "relative",
+) -> Local:
     """Return `neural_combine_frame` as a local function of images, for crops.
 
     Args:
@@ -113,6 +145,7 @@ def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> L
         denoise: denoiser of a colour and its frame.
         network: as in `neural_combine_frame`.
         frame: normalised, with variance.
+        width: as in `neural_combine_frame`.
 
     Returns:
         the function, its images and how far it sees.
@@ -121,7 +154,6 @@ def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> L
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> from jscomb.learning.recipes import shipped
         >>> one = jnp.ones((4, 4, 3), jnp.float32)
@@ -129,11 +161,11 @@ def plan_neural(key: Key, denoise: Denoise, network: Network, frame: Frame) -> L
         >>> same = lambda color, frame: color
         >>> plan = plan_neural(jax.random.key(0), same, shipped("pd"), frame)
         >>> print(list(plan.images))
-        ['unbiased', 'biased', 'variance', 'sure']
+        ['unbiased', 'biased', 'variance', 'sure', 'noise']
     """
     inputs = neural_inputs(key, denoise, frame)
-    x, v, noise = (inputs.get(name) for name in ("unbiased", "variance", "noise"))
-    sigma = compiled(bound_sigma)(x, v, noise=noise)
+    x, v, noise = (inputs[name] for name in ("unbiased", "variance", "noise"))
+    sigma = compiled(bound_sigma, width=width)(x, v, noise=noise)
     around = reach_of(BOUND_WINDOW)
     more = {"sigma": sigma}
     return network_plan(combine_inputs, network, inputs, around=around, more=more)
@@ -148,14 +180,14 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
         frame: normalised, with variance.
 
     Returns:
-        x, y, robust variance and SURE, and the noise of the channels' mean if there
-        are half buffers, named as by `neural_combine`, in its order.
+        x, y, robust variance, SURE and the noise of the channels' mean, named as by
+        `neural_combine`, in its order. Without half buffers nothing tells how alike the
+        channels' noise is; then the most is assumed, that it is grey.
 
     Raises:
         ValueError: if the frame has no variance or is not normalised.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> from jscomb.frame import make_frame
         >>> one = jnp.ones((4, 4, 3))
         >>> frame = make_frame(one, variance=one).normalised()
@@ -168,8 +200,14 @@ def neural_inputs(key: Key, denoise: Denoise, frame: Frame) -> dict[str, Image]:
     x, v = frame.color, robust_variance(frame.variance)
     one = lambda color: denoise(color, frame)
     y, s, _ = monte_carlo_sure(key, one, x, v, slope_limit=_SLOPE_LIMIT)
-    inputs = {"unbiased": x, "biased": y, "variance": v, "sure": s}
     if frame.sub_buffers > 1:
         a, b = (half.color for half in frame.halves())
-        inputs["noise"] = compiled(channel_variance)(a, b, v)
-    return inputs
+        noise = compiled(channel_variance)(a, b, v)
+    else:
+        noise = compiled(_of_grey)(v)
+    return {"unbiased": x, "biased": y, "variance": v, "sure": s, "noise": noise}
+
+
+def _of_grey(variance: Variance) -> Noise:
+    """Variance of the mean of channels that have one noise, [H,W,1]."""
+    return jnp.square(jnp.mean(safe_sqrt(variance), axis=-1, keepdims=True))

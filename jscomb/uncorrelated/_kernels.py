@@ -1,9 +1,10 @@
 """Kernels: weights as a function of the differences of B sub-averages.
 
-A kernel takes B arrays of one shape, the differences D_ci z^1, ..., D_ci z^B, and
-returns weights in [0, 1] of that shape, elementwise.
+A kernel takes B arrays of one shape, the differences D_ci z^1, ..., D_ci z^B, or those
+of y, or of both, and returns weights in [0, 1] of that shape, elementwise.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jscomb.numerics.medians import median_of
 from jscomb.typing import Key, Scalar
-from jscomb.uncorrelated._pairs import Samples, check_samples
+from jscomb.uncorrelated._pairs import Samples, check_rate
 
 Kernel = Callable[..., Array]
 
@@ -20,17 +22,21 @@ _TRIALS = 4096
 
 
 def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
-    """Return the paper's kernel: less weight where two sub-averages differ more.
+    """Return the paper's kernel: less weight where sub-averages differ more.
+
+    For any number of sub-averages the square is twice their sample variance: the mean
+    square of the pairs' differences, of the same expectation and less noise the more
+    there are.
 
     Args:
         gamma: at least zero, per squared radiance.
         samples: n, samples a pixel in each sub-average, at least 1.
 
     Returns:
-        a kernel of two differences.
+        a kernel of two differences or more.
 
     Raises:
-        ValueError: if `samples` is less than 1.
+        ValueError: if gamma is negative or `samples` is less than 1.
 
     Example:
         >>> kernel = variance_kernel(0.01, 8)
@@ -40,11 +46,47 @@ def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
 
     Source: IDU eq. 8.
     """
-    check_samples(samples)
+    check_rate(gamma, samples)
 
-    def kernel(first: Array, second: Array) -> Array:
-        rate = rate_of(gamma, samples, first.dtype)
-        return jnp.exp(-rate * jnp.square(first - second))
+    def kernel(*differences: Array) -> Array:
+        d = jnp.stack(differences)
+        square = jnp.sum(jnp.square(d - jnp.mean(d, axis=0, keepdims=True)), axis=0)
+        rate = rate_of(gamma, samples, d.dtype)
+        return jnp.exp(-2 * rate / (len(d) - 1) * square)
+
+    return kernel
+
+
+def median_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
+    """Return a kernel by the median square of the pairs' differences.
+
+    One sub-average with a firefly does not change the median of three pairs or more:
+    a pixel keeps the weight that the others give it.
+
+    Args:
+        gamma: at least zero, per squared radiance.
+        samples: n, samples a pixel in each sub-average, at least 1.
+
+    Returns:
+        a kernel of two differences or more; of two the paper's.
+
+    Raises:
+        ValueError: if gamma is negative or `samples` is less than 1.
+
+    Example:
+        >>> kernel = median_kernel(1.0, 1)
+        >>> one, firefly = jnp.ones(1), jnp.full(1, 1e6)
+        >>> print(kernel(one, one, one, one, firefly))
+        [1.]
+
+    Source: ours, after IDU eq. 8; admissible by theorem 2.
+    """
+    check_rate(gamma, samples)
+
+    def kernel(*differences: Array) -> Array:
+        pairs = itertools.combinations(differences, 2)
+        square = median_of(jnp.stack([jnp.square(d - e) for d, e in pairs]))
+        return jnp.exp(-rate_of(gamma, samples, square.dtype) * square)
 
     return kernel
 

@@ -1,7 +1,9 @@
 """Pairs of sub-averages, checked, with zeros at invalid pixels."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
+import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
@@ -10,6 +12,8 @@ from jscomb.typing import Image, Mask
 
 SubAverages = Float[Array, "b h w c"]
 Samples = Real[Array, ""] | float | int
+Gamma = Float[Array, "*map"] | float
+Guides = Literal["correlated", "independent", "both"]
 
 
 class Pairs(NamedTuple):
@@ -31,6 +35,14 @@ class Pairs(NamedTuple):
     def some(self, which: slice) -> "Pairs":
         """Return only these pairs, valid where all are."""
         return self._replace(y=self.y[which], z=self.z[which])
+
+    def guides(self, which: Guides) -> SubAverages:
+        """Return the sub-averages whose differences the weights depend on."""
+        if which not in get_args(Guides):
+            raise ValueError(f"guides must be one of {get_args(Guides)}, got {which!r}")
+        if which == "both":
+            return jnp.concatenate([self.z, self.y])
+        return self.z if which == "correlated" else self.y
 
     @property
     def mean(self) -> Image:
@@ -73,3 +85,10 @@ def check_samples(samples: Samples) -> None:
     """Raise if there is less than one sample; not checked while tracing."""
     if not isinstance(samples, Tracer) and not samples >= 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
+
+
+def check_rate(gamma: Gamma, samples: Samples) -> None:
+    """Raise if gamma is negative or there is no sample; not checked while tracing."""
+    check_samples(samples)
+    if not isinstance(gamma, Tracer) and not np.all(np.asarray(gamma) >= 0):
+        raise ValueError(f"gamma must be at least zero, got {np.min(gamma)}")

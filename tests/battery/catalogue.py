@@ -213,7 +213,9 @@ def combiners() -> dict[str, Entry]:
             max(njs.reach, 7) + james_stein.reach(window=7),
             multiple=njs.multiple,
         ),
-        "ensemble.combine": Entry(_ensemble, rounding=1e-4),
+        "ensemble.combine": Entry(
+            lambda r: _ensemble(r, solver="hull", filter=True), rounding=1e-4
+        ),
         "ensemble.combine multi-scale": Entry(
             lambda r: _ensemble(r, solver="multi-scale", windows=(7, 11))
         ),
@@ -223,6 +225,12 @@ def combiners() -> dict[str, Entry]:
             multiple=mixed.multiple,
         ),
         "uncorrelated.combine": Entry(_uncorrelated(uncorrelated.combine, 2), 7),
+        "uncorrelated.combine of both": Entry(
+            _uncorrelated(functools.partial(uncorrelated.combine, guides="both"), 4), 7
+        ),
+        "uncorrelated.combine_median": Entry(
+            _uncorrelated(uncorrelated.combine_median, 4), 7
+        ),
         "uncorrelated.combine_crosswise": Entry(
             _uncorrelated(uncorrelated.combine_crosswise, 4), 7
         ),
@@ -432,7 +440,11 @@ def solvers(*, window: int | None = None) -> dict[str, Entry]:
             rounding=2e-3,
             backwards=False,
         ),
-        "ensemble.solve_weights": Entry(_by(ensemble.solve_weights), 1, rounding=2e-5),
+        "ensemble.solve_weights": Entry(
+            _by(functools.partial(ensemble.solve_weights, solver="hull")),
+            1,
+            rounding=2e-5,
+        ),
         "poisson.reconstruct": Entry(_poisson),
         "regression.local_linear": Entry(_normalised(regressed), far),
         "regression.joint_local_linear": Entry(_normalised(jointly), far),

@@ -162,6 +162,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         ),
         "ensemble.average": lambda r: ensemble.average(bases(r)[0], weights(r)),
         "ensemble.spread": lambda r: ensemble.spread(bases(r)[0], weights(r)),
+        "ensemble.selection_errors": lambda r: ensemble.selection_errors(
+            *_of_bases(r), r.variance, r.variance
+        ),
         "ensemble.one_hot": lambda r: ensemble.one_hot(jnp.square(bases(r)[0])),
         "double_shrinkage.unbiased_error": (
             lambda r: double_shrinkage.unbiased_error(*_of_radiance(r))
@@ -172,7 +175,7 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
         "double_shrinkage.dependence": (
             lambda r: double_shrinkage.dependence(*r[:4]).correlation
         ),
-        "double_shrinkage.confidence": lambda r: double_shrinkage.confidence(
+        "double_shrinkage.prior_error": lambda r: double_shrinkage.prior_error(
             r.biased, *_of_radiance(r), shared(r)
         ),
         "double_shrinkage.limit_prior": lambda r: double_shrinkage.limit_prior(
@@ -204,6 +207,9 @@ def _combining(flow: Callable[[Rendering], tuple]) -> dict[str, Function]:
             jnp.stack(r[:3], axis=2)
         ),
         "uncorrelated.select_gamma": lambda r: uncorrelated.select_gamma(*flow(r)),
+        "uncorrelated.select_gamma_map": (
+            lambda r: uncorrelated.select_gamma_map(*flow(r), region=9)
+        ),
         "uncorrelated.relative_variances": (
             lambda r: uncorrelated.relative_variances(*flow(r))
         ),

@@ -54,6 +54,7 @@ ELSEWHERE = {
         "oidn.tune",
         "oidn.tune_frame",
         "progressive.combine_frame",
+        "rdfc.denoise_selected_frame",
         "progressive.neural_combine_frame",
         "progressive.neural_inputs",
         "progressive.plan_neural",
@@ -74,6 +75,7 @@ ELSEWHERE = {
         "sure.exact_sure",
         "uncorrelated.admissibility",
         "uncorrelated.combine_with",
+        "uncorrelated.median_kernel",
         "uncorrelated.variance_kernel",
     },
     "what others are held against, in float64": {
@@ -81,6 +83,7 @@ ELSEWHERE = {
         "simplex.reference_quadratic",
     },
     "of features, which have no unit": {"oidn.denoise_feature"},
+    "selects filters that are here by a risk that is here": {"rdfc.denoise_selected"},
     "not of images": {"james_stein.rule_of", "oidn.available", "oidn.pretrained"},
 }
 ROOMS = (

@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics import cholesky
+from jscomb.numerics.guards import divide
 from jscomb.numerics.simplex._active_set import (
     Flat,
     Free,
@@ -17,6 +18,8 @@ from jscomb.numerics.simplex._active_set import (
     sums_to_one,
 )
 from jscomb.numerics.simplex._hull import share_within
+
+_LARGEST = 1e3  # affine weight: beyond, more is lost to rounding than gained
 
 Matrix = Float[Array, "n n *batch"]
 Weights = Float[Array, "n *batch"]
@@ -57,8 +60,7 @@ def _solve(matrix: Float[Array, "n n m"]) -> Flat:
     matrix = _known(matrix)
     objective = _objective(matrix)
     fixed = Objective(*lax.stop_gradient(tuple(objective)))
-    best = jnp.argmin(_diagonal(matrix), axis=0, keepdims=True)
-    start = jnp.arange(len(matrix))[:, None] == best
+    start = _best(matrix)
 
     def minimise(free: Free) -> tuple[Flat, Flat]:
         w, level = _minimum(fixed, free)
@@ -78,11 +80,16 @@ def _solve(matrix: Float[Array, "n n m"]) -> Flat:
 def affine(matrix: Matrix) -> Weights:
     """Minimise w'Mw over weights of either sign that sum to one.
 
+    Bases that hardly differ, and more of them than a matrix has ranks, reach a small
+    minimum by huge weights of either sign. Weights beyond 1000 are moved towards the
+    best base alone, which also stands where rounding destroys the minimum; so no result
+    has a larger w'Mw than the best base, but for rounding.
+
     Args:
         matrix: M, any unit, shape [N,N,...].
 
     Returns:
-        the weights, shape [N,...].
+        the weights, of sum one and at most about 1000 in size, shape [N,...].
 
     Raises:
         ValueError: while tracing, if the matrix is not square or N is 0.
@@ -96,9 +103,31 @@ def affine(matrix: Matrix) -> Weights:
     Source: ED eq. 19; a ridge instead of the pseudo-inverse, which takes the wrong
     limit where a combination without error exists.
     """
-    objective = objective_of(matrix)
-    w, _ = _minimum(objective, jnp.ones(objective.linear.shape, bool))
-    return w.reshape(matrix.shape[1:])
+    _check(matrix)
+    n, *batch = matrix.shape[1:]
+    return in_chunks(_solve_affine, matrix.reshape(n, n, -1)).reshape(n, *batch)
+
+
+def _solve_affine(matrix: Float[Array, "n n m"]) -> Flat:
+    """Solve M problems without bounds."""
+    matrix = _known(matrix)
+    objective = _objective(matrix)
+    fixed = Objective(*lax.stop_gradient(tuple(objective)))
+    start = _best(matrix)
+    w, _ = _minimum(fixed, jnp.ones_like(start))
+    curved = jnp.sum(fixed.matrix * w[None], axis=1)
+    value = jnp.sum(w * (curved / 2 + fixed.linear), axis=0)
+    of_best = jnp.sum(jnp.where(start, _diagonal(fixed.matrix), 0.0), axis=0) / 2
+    solved = sums_to_one(w) & (value <= of_best)
+    w, _ = _minimum(objective, start | solved[None])
+    w = w + jnp.where(start, 1 - jnp.sum(w, axis=0, keepdims=True), 0.0)
+    size = lax.stop_gradient(jnp.max(jnp.abs(w), axis=0))
+    share = divide(
+        jnp.full_like(size, _LARGEST), size, where=size > _LARGEST, otherwise=1.0
+    )
+    alone = start.astype(w.dtype)
+    w = alone + share[None] * (w - alone)
+    return shared_by_equals(w, jnp.all(matrix[:, None] == matrix[None], axis=2))
 
 
 class Objective(NamedTuple):
@@ -128,6 +157,12 @@ def _diagonal(matrix: Matrix) -> Weights:
     return jnp.stack([matrix[i, i] for i in range(len(matrix))])
 
 
+def _best(matrix: Float[Array, "n n m"]) -> Free:
+    """Whether a base is the one of minimum error, the first of equals."""
+    best = jnp.argmin(_diagonal(matrix), axis=0, keepdims=True)
+    return jnp.arange(len(matrix))[:, None] == best
+
+
 def objective_of(matrix: Matrix) -> Objective:
     """Return the objectives of matrices [N,N,...]; without unit."""
     _check(matrix)
@@ -142,8 +177,7 @@ def _objective(m: Float[Array, "n n m"]) -> Objective:
     bases share and that of a bad base. The row and column of b are 0; a number added to
     all of K makes it definite.
     """
-    n, diagonal = len(m), _diagonal(m)
-    best = jnp.arange(n)[:, None] == jnp.argmin(diagonal, axis=0)[None]
+    n, diagonal, best = len(m), _diagonal(m), _best(m)
     column = jnp.sum(jnp.where(best[None], m, 0.0), axis=1)  # M_ib
     lowest = jnp.sum(jnp.where(best, diagonal, 0.0), axis=0)  # M_bb
     linear = column - lowest[None]

@@ -58,14 +58,15 @@ def noise_free_weights(
     *,
     epsilon: float,
 ) -> Weights:
-    """Return weights exp(-(|g_i - g_c|^2 - v_i - v_c) / (v_i + v_c + eps)).
+    """Return weights exp(-(|g_i - g_c|^2 - G (v_i + v_c)) / (v_i + v_c + eps)).
 
     Gaussian weights of a distance minus what noise alone contributes to it: in a mean
-    over windows, noisier pixels count up to e times as much.
+    over windows, noisier pixels count up to exp(G) times as much.
 
     Args:
         guide: g, shape [H,W,G].
-        variance: v of the guide, its unit squared, at least zero, shape [H,W,1].
+        variance: v of the guide, mean over its channels, its unit squared, at least
+            zero, shape [H,W,1].
         epsilon: > 0, in the same unit.
 
     Returns:
@@ -83,13 +84,14 @@ def noise_free_weights(
         >>> print([f"{value:.2f}" for value in mean.ravel()])  # (1 + 3 e) / (1 + e), 2
         ['2.46', '2.00']
 
-    Source: DSC eq. 17.
+    Source: DSC eq. 17, for colours: the paper has one channel.
     """
     gaussian = gaussian_weights(guide, 2 * variance + epsilon)
+    channels = guide.shape[-1]
 
     def pair(p: Pairs, q: Pairs) -> Array:
         bandwidth = _mean_of_both(p[-1], q[-1])  # v_i + v_c + eps
-        return gaussian.pair(p, q) * jnp.exp(1 - epsilon / bandwidth)
+        return gaussian.pair(p, q) * jnp.exp(channels * (1 - epsilon / bandwidth))
 
     return gaussian._replace(pair=pair)
 
