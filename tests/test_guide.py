@@ -131,13 +131,14 @@ def test_command_exists(words, monkeypatch):
     [
         each
         for each in commands()
-        if each.values[0][:2] in (["jscomb", "info"], ["jscomb", "compare"])
+        if each.values[0][:2] in [["jscomb", c] for c in ("info", "compare", "view")]
         or {"--method", "whitened"} <= set(each.values[0])
     ],
 )
 def test_command_runs(words, jscomb, reader):
     frame = exr.read_frame(reader / "frame.exr")
-    exr.write_image(reader / "out.exr", frame.color)
+    for name in ("out", "combined"):
+        exr.write_image(reader / f"{name}.exr", frame.color)
     status, out, error = jscomb(*words[1:])
     assert (status, error) == (0, "")
     assert out

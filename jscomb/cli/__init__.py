@@ -1,4 +1,4 @@
-"""The command `jscomb`: render, combine, compare and describe frames, and train.
+"""The command `jscomb`: render, combine, compare, view and describe frames, and train.
 
 Errors of the input are one line on standard error and exit status 2.
 """
@@ -18,7 +18,7 @@ import tyro
 from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
 from jscomb.cli._rendering import render, render_file
-from jscomb.cli._showing import compare, demo, info
+from jscomb.cli._showing import demo, info
 from jscomb.cli._training import (
     Run,
     prepare,
@@ -27,6 +27,7 @@ from jscomb.cli._training import (
     train_files,
     with_bases,
 )
+from jscomb.cli._viewing import compare, view
 
 __all__ = [
     "Run",
@@ -72,7 +73,7 @@ def _parse() -> Callable[[], None]:
             return tyro.extras.subcommand_cli_from_dict(
                 {
                     c.__name__: later(c)
-                    for c in (demo, render, combine, compare, info, train)
+                    for c in (demo, render, combine, compare, view, info, train)
                 },
                 prog="jscomb",
                 description="Combine unbiased and biased Monte Carlo renderings.",
