@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+import jscomb as package
 from jscomb import exr, metrics
 from jscomb.cli import _showing
 from jscomb.cli._showing import SHOWN
@@ -316,6 +317,21 @@ def test_a_wrong_command_line_is_one_line_too(jscomb, arguments, message):
     assert (status, out) == (2, "")
     assert re.fullmatch(r"jscomb: [ -~]+\n", error)
     assert message in error
+
+
+def test_a_wrong_option_is_said_once(jscomb):
+    _, _, error = jscomb("demo", "--nope")
+    assert error.count("--nope") == 1
+    assert error.lower().count("unrecognized options") == 1
+
+
+def test_version(jscomb):
+    status, out, _ = jscomb("--version")
+    assert (status, out) == (
+        0,
+        f"jscomb {package.__version__}, JAX {jax.__version__}\n",
+    )
+    assert "--version" in jscomb("--help")[1]
 
 
 def test_help_reads_well(jscomb):

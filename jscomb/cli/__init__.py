@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import tyro
 
+import jscomb
 from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
 from jscomb.cli._rendering import render, render_file
@@ -42,6 +43,9 @@ __all__ = [
 
 def main() -> None:
     """Run the command; the entry point of `jscomb`."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"jscomb {jscomb.__version__}, JAX {jax.__version__}")
+        return
     _use_compilation_cache()
     try:
         _parse()()
@@ -76,13 +80,16 @@ def _parse() -> Callable[[], None]:
                     for c in (demo, render, combine, compare, view, info, train)
                 },
                 prog="jscomb",
-                description="Combine unbiased and biased Monte Carlo renderings.",
+                description="Combine unbiased and biased Monte Carlo renderings. "
+                "--version prints the version.",
             )
     except SystemExit as end:
         if not end.code:
             raise  # --help
         text = re.sub(r"\x1b\[[0-9;]*m|[^\x00-\x7f]", " ", said.getvalue())
-        raise ValueError(text.replace("-" * 8, "")) from None
+        text = " ".join(text.replace("-" * 8, "").split())
+        # The heading of its message is the message's first words, too.
+        raise ValueError(re.sub(r"^(\w+ \w+) (?=\1)", "", text)) from None
 
 
 def _use_compilation_cache() -> None:

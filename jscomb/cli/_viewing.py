@@ -82,7 +82,7 @@ def compare(
             and FLIP where that is installed.
         json: print one line of JSON instead, without numbers that are not finite.
     """
-    if unknown := [name for name in metrics if name not in METRICS]:
+    if unknown := [name for name in metrics or ("",) if name not in METRICS]:
         known = ", ".join(METRICS)
         raise ValueError(f"--metrics {unknown[0]}: expected some of {known}")
     if reference is None:
