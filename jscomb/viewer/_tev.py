@@ -36,7 +36,7 @@ def send_to_tev(scene: Scene, *, host: str = "localhost", port: int = PORT) -> N
     """
     if importlib.util.find_spec("tevclient") is None:
         raise ImportError('tev needs its client: pip install "jscomb[tev]"')
-    import tevclient
+    import tevclient  # pyright: ignore[reportMissingImports]
 
     try:
         with contextlib.ExitStack() as stack:
