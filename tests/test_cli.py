@@ -1,5 +1,6 @@
 """The command: every subcommand for real, and one line with status 2 for bad input."""
 
+import importlib.util
 import json
 import os
 import re
@@ -160,7 +161,7 @@ def test_compare(jscomb, tmp_path):
     assert status == 0
     assert "1 of 400 pixels are not finite and were excluded" in out
     assert re.search(r"relative L2 +0$", out, re.M)
-    assert "FLIP of a skipped: image must have pixels and be finite" in out
+    assert "FLIP of a, HDR-FLIP of a skipped: image must have pixels and be" in out
     status, out, _ = jscomb("compare", b, b)
     assert re.search(r"HDR-FLIP +0$", out, re.M)
     assert re.search(r"PSNR in dB +inf$", out, re.M)
@@ -202,6 +203,33 @@ def test_compare_several_by_name(jscomb, tmp_path, glass_frame):
         status, _, error = jscomb(*arguments)
         assert status == 2
         assert message in error
+
+
+def test_what_is_missing_is_said_once(jscomb, tmp_path, monkeypatch):
+    """For all images and all that needs it."""
+    there = importlib.util.find_spec
+    gone = lambda name: None if name == "flip_evaluator" else there(name)
+    monkeypatch.setattr(importlib.util, "find_spec", gone)
+    for name in ("one/a", "two/a", "two/reference"):
+        path = write_in(tmp_path / f"{name}.exr", layer("", noise(0, 9, 9, 3)))
+    files = [*sorted(tmp_path.glob("*/*.exr")), path]
+    status, out, _ = jscomb(
+        "compare", *files, "--maps", tmp_path / "m", "--metrics", "flip"
+    )
+    assert status == 0
+    assert out.count('pip install "jscomb[flip]"') == 1
+    assert len(list((tmp_path / "m").glob("*one-a-relative-l2.png"))) == 1
+    assert len(list((tmp_path / "m").iterdir())) == 3
+    page = tmp_path / "p.html"
+    status, out, _ = jscomb("view", *files, "--reference", path, "-o", page)
+    assert out.count('pip install "jscomb[flip]"') == 1
+    assert "two/reference.exr" in page.read_text()
+
+
+def write_in(path, channels):
+    """Write a file, and the folder for it."""
+    path.parent.mkdir(exist_ok=True)
+    return write(path, channels)
 
 
 def test_view(jscomb, tmp_path, glass_frame, monkeypatch):

@@ -1,5 +1,6 @@
 """`jscomb compare` and `view`: images beside a reference."""
 
+import functools
 from collections.abc import Callable, Sequence
 from json import dumps
 from pathlib import Path
@@ -20,6 +21,10 @@ _Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 _Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
 _Host = Annotated[str | None, tyro.conf.arg(metavar="HOST[:PORT]")]
 _Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+Skipped = dict[str, list[str]]
+"""What is skipped, by the reason."""
 
 
 class _Metric(NamedTuple):
@@ -89,7 +94,7 @@ def compare(
         if len(images) < 2:
             raise ValueError("compare needs an image and a reference: two files")
         images, reference = images[:-1], images[-1]
-    truth = _reference(reference)
+    images, truth = tuple(dict.fromkeys(images)), _reference(reference)
     shown = {name: exr.read_image(path) for name, path in _named(images).items()}
     for image, path in zip(shown.values(), images, strict=True):
         _same_size(path, image, reference, truth.image)
@@ -98,15 +103,16 @@ def compare(
     if excluded == mask.size:
         files = " and ".join(map(str, (*images, reference)))
         raise ValueError(f"{files} have no finite pixel in common")
-    errors, skipped = _errors(shown, truth, mask, metrics)
+    skipped: Skipped = {}
+    errors = _errors(shown, truth, mask, metrics, skipped)
     if maps is not None:
-        skipped += _write_maps(maps, shown, truth.image)
+        _write_maps(maps, shown, truth.image, skipped)
     if json:
         found = {"reference": str(reference), "pixels": mask.size, "excluded": excluded}
-        print(dumps({**found, "images": errors, "skipped": skipped}))
+        print(dumps({**found, "images": errors, "skipped": _said(skipped)}))
         return
     _print(errors, metrics)
-    for line in skipped:
+    for line in _said(skipped):
         print(line)
     if excluded:
         print(f"{excluded} of {mask.size} pixels are not finite and were excluded")
@@ -143,13 +149,13 @@ def view(
         raise ValueError(f"--maps {unknown[0]}: expected some of flip, hdr-flip")
     if not images:
         raise ValueError("view needs an image: jscomb view FILE ...")
+    images = tuple(dict.fromkeys(images))
     shown, truth = _shown(images, reference)
-    made = {}
+    made, skipped = {}, {}
     if truth is not None and tev is None:
-        others = {name: image for name, image in shown.items()}
-        for kind in maps:
-            made[kind], skipped = _maps(kind, others, truth.image)
-            print("".join(f"{line}\n" for line in skipped), end="")
+        made = {kind: _maps(kind, shown, truth.image, skipped) for kind in maps}
+    for line in _said(skipped):
+        print(line)
     title = ", ".join(path.stem for path in images)
     scene = viewer.make_scene(title, shown, reference=truth, maps=made)
     if tev is not None:
@@ -190,9 +196,9 @@ def _shown(
 
 
 def _named(paths: Sequence[Path]) -> dict[str, Path]:
-    """Files by their stems, or by their whole names where stems are alike."""
+    """Files by their stems, or by their whole names where those are not clear."""
     stems = [path.stem for path in paths]
-    whole = len(set(stems)) < len(stems)
+    whole = len(set(stems)) < len(stems) or "reference" in stems
     return {str(path) if whole else path.stem: path for path in paths}
 
 
@@ -209,12 +215,15 @@ def _same_size(path: Path, image: Array, other: Path, another: Array) -> None:
 
 
 def _errors(
-    images: dict[str, Image], truth: Reference, mask: Mask, names: Sequence[str]
-) -> tuple[dict[str, dict[str, float | None]], list[str]]:
-    """Errors by image and metric, and why others are skipped."""
+    images: dict[str, Image],
+    truth: Reference,
+    mask: Mask,
+    names: Sequence[str],
+    skipped: Skipped,
+) -> dict[str, dict[str, float | None]]:
+    """Errors by image and metric."""
     r, noise = truth
     errors: dict[str, dict[str, float | None]] = {name: {} for name in images}
-    skipped = []
     for key in names:
         title, measure, masked, less_noise = METRICS[key]
         if less_noise and noise is None:
@@ -223,43 +232,53 @@ def _errors(
         if less_noise:
             options["half_difference"] = noise
         for name, image in images.items():
-            try:
-                value = float(measure(image, r, **options))
-            except (ValueError, ImportError, RuntimeError) as error:
-                skipped.append(f"{title} of {name} skipped: {error}")
-                continue
-            errors[name][key] = value if np.isfinite(value) else None
-    return errors, skipped
+            make = functools.partial(measure, image, r, **options)
+            value = _unless_skipped(f"{title} of {name}", make, skipped)
+            if value is not None:
+                errors[name][key] = float(value) if np.isfinite(value) else None
+    return errors
 
 
 def _maps(
-    kind: str, images: dict[str, Image], reference: Image
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Maps of errors by image, and why others are skipped."""
-    made, skipped = {}, []
+    kind: str, images: dict[str, Image], reference: Image, skipped: Skipped
+) -> dict[str, np.ndarray]:
+    """Maps of errors by image."""
+    made = {}
     for name, image in images.items():
-        try:
-            made[name] = np.asarray(MAPS[kind](image, reference))
-        except (ValueError, ImportError, RuntimeError) as error:
-            skipped.append(f"map {kind} of {name} skipped: {error}")
-    return made, skipped
+        make = functools.partial(MAPS[kind], image, reference)
+        error = _unless_skipped(f"map {kind} of {name}", make, skipped)
+        if error is not None:
+            made[name] = np.asarray(error)
+    return made
 
 
-def _write_maps(folder: Path, images: dict[str, Image], reference: Image) -> list[str]:
-    """Write pictures of errors; return why others are skipped."""
+def _unless_skipped(what: str, make: Callable[[], Any], skipped: Skipped) -> Any:
+    """What is made; None, with the reason noted, where it cannot be."""
+    try:
+        return make()
+    except (ValueError, ImportError, RuntimeError) as error:
+        skipped.setdefault(str(error), []).append(what)
+        return None
+
+
+def _said(skipped: Skipped) -> list[str]:
+    """A line for each reason."""
+    return [f"{', '.join(what)} skipped: {reason}" for reason, what in skipped.items()]
+
+
+def _write_maps(
+    folder: Path, images: dict[str, Image], reference: Image, skipped: Skipped
+) -> None:
+    """Write pictures of errors."""
     from jscomb import plots  # matplotlib is slow to import
 
     folder.mkdir(parents=True, exist_ok=True)
-    all_skipped = []
     for kind in ("relative-l2", "flip"):
-        made, skipped = _maps(kind, images, reference)
-        all_skipped += skipped
         flat = {"limits": (0.0, 1.0), "logarithmic": False} if kind == "flip" else {}
-        for name, error in made.items():
-            title = f"{METRICS[kind].title} of {Path(name).stem}"
-            file = folder / f"{Path(name).stem}-{kind}.png"
-            plots.error_map(file, error, title=title, **flat)
-    return all_skipped
+        for name, error in _maps(kind, images, reference, skipped).items():
+            title = f"{METRICS[kind].title} of {name}"
+            file = "-".join(Path(name).with_suffix("").parts).strip("-/")
+            plots.error_map(folder / f"{file}-{kind}.png", error, title=title, **flat)
 
 
 def _print(errors: dict[str, dict[str, float | None]], names: Sequence[str]) -> None:
