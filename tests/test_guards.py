@@ -8,7 +8,15 @@ from jax.test_util import check_grads
 
 from jscomb import james_stein, metrics
 from jscomb.denoisers import bilateral, nonlocal_means, rdfc, smoothing
-from jscomb.numerics import guards, kernels, luminance, weights, windows
+from jscomb.numerics import (
+    guards,
+    kernels,
+    luminance,
+    regression,
+    sure,
+    weights,
+    windows,
+)
 
 
 @pytest.mark.parametrize("d", [1e-30, 1e-8, 1.0, 1e18])
@@ -175,6 +183,17 @@ def test_a_batch_and_several_windows_say_what_helps(name):
         with pytest.raises(ValueError, match=static):
             mapped(lambda window: function(x, window))(jnp.array([3, 5]))
     assert jax.vmap(lambda x: function(x, 3))(jnp.stack([x, x])).shape == (2, 6, 5, 3)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_other_static_options_are_named():
+    fit = lambda stride: regression.local_linear(x, x, x, 1.0, window=5, stride=stride)
+    risk = lambda probes: sure.monte_carlo_sure(
+        jax.random.key(0), lambda x: x, x, x, probes=probes
+    )
+    for name, function in {"stride": fit, "probes": risk}.items():
+        with pytest.raises(ValueError, match=f"{name} is static: it must be"):
+            jax.vmap(function)(jnp.array([1, 2]))
 
 
 @pytest.mark.usefixtures("unchecked")

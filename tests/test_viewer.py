@@ -371,6 +371,17 @@ def test_two_viewers_share_a_page(browser, scene, tmp_path):
     assert first.complaints() == []
 
 
+def test_what_cannot_be_shown_is_said(browser, tmp_path):
+    path = tmp_path / "wide.html"
+    wide = viewer.make_scene("wide", {"a": np.ones((1, 99_999, 1), np.float32)})
+    path.write_text(viewer.page([wide]))
+    browser.get(path.as_uri())
+    said = browser.find_element("css selector", ".failed").text
+    assert re.fullmatch(
+        r"wide is 99999x1 pixels; this browser shows at most \d+\.", said
+    )
+
+
 def test_images_reach_tev(images):
     """Over its protocol, decoded here by what its documentation says."""
     pytest.importorskip("tevclient")

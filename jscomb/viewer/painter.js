@@ -146,7 +146,7 @@ function makePainter(colours) {
 
   /* Into a 2D canvas. how: image, reference, map (pixels or null), kind, origin, scale, gain,
      curve, range [low, high], logarithmic, epsilon. */
-  return function paint(target, how) {
+  function paint(target, how) {
     if (canvas.width < target.width || canvas.height < target.height) {
       canvas.width = Math.max(canvas.width, target.width);
       canvas.height = Math.max(canvas.height, target.height);
@@ -179,7 +179,8 @@ function makePainter(colours) {
     // The viewport is at the lower left of the shared canvas.
     context.drawImage(canvas, 0, canvas.height - target.height, target.width, target.height,
       0, 0, target.width, target.height);
-  };
+  }
+  return Object.assign(paint, { largest: gl.getParameter(gl.MAX_TEXTURE_SIZE) });
 }
 
 /* Bytes of a deflated, base64 text whose numbers were split into planes of bytes. */

@@ -2,9 +2,12 @@
 function makeViewer(root, { scenes, colours }) {
   const lut = Uint8Array.from(atob(colours), c => c.charCodeAt(0));
   const paint = makePainter(lut);
-  if (!paint) {
+  const large = paint && scenes.find(each => Math.max(each.width, each.height) > paint.largest);
+  if (!paint || large) {
+    const why = paint ? `${large.name} is ${large.width}x${large.height} pixels; this browser shows at most ${paint.largest}.`
+      : "This viewer needs WebGL 2, which this browser does not have or has switched off.";
     root.dataset.ready = "failed";
-    root.append(made("p", { className: "failed", textContent: "This viewer needs WebGL 2, which this browser does not have or has switched off." }));
+    root.append(made("p", { className: "failed", textContent: why }));
     return;
   }
   const state = { scene: 0, panes: [], active: 0, stops: 0, curve: "sRGB", zoom: 1, x: .5, y: .5, slide: false, split: .5, ranges: {}, crops: [] };
@@ -346,7 +349,7 @@ function makeViewer(root, { scenes, colours }) {
         return made("figure", {}, cell(image, "image"), ...(kind ? [cell(image, kind)] : []), made("figcaption", { textContent: text }));
       });
       const remove = made("button", { textContent: "×", title: "remove this inset", onclick: () => { state.crops.splice(number, 1); draw(); } });
-      return made("div", { className: `row c${number % 4}` }, made("div", { className: "crop" }, `${w}×${h} at (${x}, ${y}) `, remove), ...cells);
+      return made("div", { className: `row c${number % 4}` }, made("div", { className: "crop" }, `${w}x${h} at (${x}, ${y}) `, remove), ...cells);
     }));
     return whole;
   }
