@@ -9,10 +9,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import tyro
 from jaxtyping import Array
+from tqdm import tqdm
 
 from jscomb import exr, metrics
 from jscomb.frame import Reference
 from jscomb.numerics.guards import finite
+from jscomb.numerics.tiles import compiled
 from jscomb.typing import Image, Mask
 
 _Files = tyro.conf.Positional[tuple[Path, ...]]
@@ -224,11 +226,12 @@ def _errors(
     """Errors by image and metric."""
     r, noise = truth
     errors: dict[str, dict[str, float | None]] = {name: {} for name in images}
-    for key in names:
+    for key in tqdm(names, unit="metric", disable=None, leave=False):
         title, measure, masked, less_noise = METRICS[key]
         if less_noise and noise is None:
             continue
         options: dict[str, Any] = {"mask": mask} if masked else {}
+        measure = compiled(measure) if masked else measure
         if less_noise:
             options["half_difference"] = noise
         for name, image in images.items():
@@ -244,7 +247,7 @@ def _maps(
 ) -> dict[str, np.ndarray]:
     """Maps of errors by image."""
     made = {}
-    for name, image in images.items():
+    for name, image in tqdm(images.items(), desc=kind, disable=None, leave=False):
         make = functools.partial(MAPS[kind], image, reference)
         error = _unless_skipped(f"map {kind} of {name}", make, skipped)
         if error is not None:
