@@ -5,16 +5,16 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 
 from jscomb.frame import Frame
-from jscomb.metrics import rel_l2, tone_map
+from jscomb.metrics import rel_l2, rel_l2_map, tone_map
 from jscomb.numerics.guards import finite
 from jscomb.typing import Image
 
-__all__ = ["comparison"]
+__all__ = ["comparison", "error_map"]
 
 _ERRORS = (1e-4, 1e0)  # relative squared error from black to white
 
@@ -90,9 +90,55 @@ def _show(axis: Axes, image: Array, title: str) -> None:
 
 def _show_error(axis: Axes, image: Array, reference: Array, title: str) -> None:
     """Show the relative squared error of each pixel on a logarithmic scale."""
-    square = np.mean((np.asarray(image) - reference) ** 2, axis=-1)
-    relative = square / (np.mean(reference, axis=-1) ** 2 + 0.01)
-    shown = np.maximum(relative, _ERRORS[0])  # 0 would be transparent
+    error = rel_l2_map(image, reference)[..., 0]
+    shown = np.maximum(error, _ERRORS[0])  # 0 would be transparent
     norm = LogNorm(*_ERRORS)
     axis.imshow(shown, cmap="magma", norm=norm, interpolation="nearest")
     axis.set_title(title, fontsize=9)
+
+
+def error_map(
+    path: str | os.PathLike,
+    error: ArrayLike,
+    *,
+    title: str,
+    limits: tuple[float, float] = _ERRORS,
+    logarithmic: bool = True,
+) -> None:
+    """Write a picture of a map of errors at its full size, with a colour bar.
+
+    Args:
+        path: PNG file to write.
+        error: [H,W,1]; pixels that are not finite are white.
+        title: above the map.
+        limits: errors from black to white.
+        logarithmic: the scale of the colours.
+
+    Returns:
+        nothing.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     error_map(f"{folder}/e.png", np.full((4, 4, 1), 0.1), title="error")
+        ...     print(os.listdir(folder))
+        ['e.png']
+    """
+    values = np.asarray(error)[..., 0]
+    height, width = values.shape
+    low, high = limits
+    norm = (LogNorm if logarithmic else Normalize)(low, high)
+    right, above = 90, 40  # pixels for the colour bar and the title
+    size = np.array([width + right, max(height, 120) + above])
+    figure = plt.figure(figsize=tuple(size / 100), dpi=100)
+    box = lambda x, y, w, h: figure.add_axes(
+        tuple(np.array([x, y, w, h]) / [*size, *size])
+    )
+    axis = box(0, size[1] - above - height, width, height)
+    axis.axis("off")
+    shown = np.where(values < low, low, values)
+    drawn = axis.imshow(shown, cmap="magma", norm=norm, interpolation="nearest")
+    figure.colorbar(drawn, cax=box(width + 10, 10, 14, size[1] - above - 20))
+    figure.text(0.01, 1 - 8 / size[1], title, fontsize=9, va="top")
+    figure.savefig(path)
+    plt.close(figure)

@@ -4,6 +4,7 @@ import gc
 import itertools
 import os
 import pathlib
+import shutil
 import sys
 
 import jax
@@ -89,6 +90,25 @@ def jscomb(monkeypatch, capsys):
         return status, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Headless Chromium, whose graphics are drawn by the processor."""
+    paths = [shutil.which(name) for name in ("chromium", "chromedriver")]
+    if None in paths:
+        pytest.skip("needs Debian's chromium and chromium-driver")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = paths[0]
+    drawing = "--use-angle=swiftshader", "--enable-unsafe-swiftshader"
+    for flag in ("--headless=new", "--no-sandbox", "--window-size=1200,900", *drawing):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(executable_path=paths[1])
+    driver = webdriver.Chrome(options=options, service=service)
+    yield driver
+    driver.quit()
 
 
 @pytest.fixture(scope="module")

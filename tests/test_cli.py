@@ -1,5 +1,7 @@
 """The command: every subcommand for real, and one line with status 2 for bad input."""
 
+import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -9,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+import jscomb as package
 from jscomb import exr, metrics
 from jscomb.cli import _showing
 from jscomb.cli._showing import SHOWN
@@ -158,9 +161,122 @@ def test_compare(jscomb, tmp_path):
     assert status == 0
     assert "1 of 400 pixels are not finite and were excluded" in out
     assert re.search(r"relative L2 +0$", out, re.M)
-    assert "FLIP  skipped: image must have pixels and be finite" in out
+    assert "FLIP of a, HDR-FLIP of a skipped: image must have pixels and be" in out
     status, out, _ = jscomb("compare", b, b)
     assert re.search(r"HDR-FLIP +0$", out, re.M)
+    assert re.search(r"PSNR in dB +inf$", out, re.M)
+
+
+def test_compare_several_by_name(jscomb, tmp_path, glass_frame):
+    """In a table, as JSON, and as pictures, over the pixels that all have."""
+    r, y = glass_frame.reference.image, glass_frame.estimates["oidn"].image
+    exr.write_image(tmp_path / "y.exr", y)
+    exr.write_image(tmp_path / "x.exr", y.at[:3].set(np.nan))
+    command = ("compare", tmp_path / "y.exr", tmp_path / "x.exr", "--reference", GLASS)
+    chosen = ("--metrics", "psnr", "relative-l2", "flip")
+    status, out, _ = jscomb(*command, *chosen)
+    assert status == 0
+    head, psnr, error, flip, *rest = out.splitlines()
+    assert head.split() == ["y", "x"]
+    assert psnr.startswith("PSNR in dB".rjust(40))
+    assert flip.split()[-1] == "-"
+    assert rest[0].startswith("FLIP of x skipped: image must")
+    assert "192 of 4096 pixels are not finite" in rest[1]
+    mask = finite(y.at[:3].set(np.nan))
+    expected = float(metrics.rel_l2(y, r, mask=mask))
+    np.testing.assert_allclose([float(v) for v in error.split()[2:]], expected, 1e-5)
+    folder = tmp_path / "maps"
+    status, out, _ = jscomb(*command, *chosen, "--json", "--maps", folder)
+    said = json.loads(out)
+    np.testing.assert_allclose(said["images"]["x"]["relative-l2"], expected, 1e-5)
+    assert list(said["images"]["x"]) == ["psnr", "relative-l2"]
+    assert (said["pixels"], said["excluded"]) == (4096, 192)
+    names = {"y-relative-l2.png", "y-flip.png", "x-relative-l2.png"}
+    assert {path.name for path in folder.iterdir()} == names
+    status, out, _ = jscomb("compare", GLASS, GLASS, "--json", "--metrics", "psnr")
+    value = json.loads(out)["images"]["cornell-glass-64"]["psnr"]
+    np.testing.assert_allclose(value, metrics.psnr(glass_frame.color, r), rtol=1e-5)
+    for arguments, message in (
+        ([*command, "--metrics", "mse"], "--metrics mse: expected some of relative-l2"),
+        (["compare", GLASS], "two files"),
+    ):
+        status, _, error = jscomb(*arguments)
+        assert status == 2
+        assert message in error
+
+
+def test_what_is_missing_is_said_once(jscomb, tmp_path, monkeypatch):
+    """For all images and all that needs it."""
+    there = importlib.util.find_spec
+    gone = lambda name: None if name == "flip_evaluator" else there(name)
+    monkeypatch.setattr(importlib.util, "find_spec", gone)
+    for name in ("one/a", "two/a", "two/reference"):
+        path = write_in(tmp_path / f"{name}.exr", layer("", noise(0, 9, 9, 3)))
+    files = [*sorted(tmp_path.glob("*/*.exr")), path]
+    status, out, _ = jscomb(
+        "compare", *files, "--maps", tmp_path / "m", "--metrics", "flip"
+    )
+    assert status == 0
+    assert out.count('pip install "jscomb[flip]"') == 1
+    assert len(list((tmp_path / "m").glob("*one-a-relative-l2.png"))) == 1
+    assert len(list((tmp_path / "m").iterdir())) == 3
+    page = tmp_path / "p.html"
+    status, out, _ = jscomb("view", *files, "--reference", path, "-o", page)
+    assert out.count('pip install "jscomb[flip]"') == 1
+    assert "two/reference.exr" in page.read_text()
+
+
+def write_in(path, channels):
+    """Write a file, and the folder for it."""
+    path.parent.mkdir(exist_ok=True)
+    return write(path, channels)
+
+
+def test_view(jscomb, tmp_path, glass_frame, monkeypatch):
+    """The page holds a frame's images; another may be the reference."""
+    page = tmp_path / "pages" / "p.html"
+    status, out, _ = jscomb("view", GLASS, "-o", page)
+    assert status == 0
+    assert f"wrote {page}" in out
+    held = lambda: json.loads(
+        re.search(r"data-scenes>(.*?)</script>", page.read_text())[1]
+    )
+    (scene,) = held()["scenes"]
+    names = ["cornell-glass-64", "oidn", "reference"]
+    assert [image["name"] for image in scene["images"]] == names
+    assert list(scene["images"][1]["maps"]) == ["flip"]
+    error = metrics.rel_l2(
+        glass_frame.estimates["oidn"].image,
+        glass_frame.reference.image,
+        half_difference=glass_frame.reference.half_difference,
+    )
+    assert scene["images"][1]["note"] == f"relative L2 {float(error):.3g}"
+    exr.write_image(tmp_path / "y.exr", glass_frame.estimates["oidn"].image)
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    few = ("--maps", "hdr-flip", "--open", "-o", page)
+    files = (tmp_path / "y.exr", GLASS, "--reference", tmp_path / "y.exr")
+    assert jscomb("view", *files, *few)[0] == 0
+    (scene,) = held()["scenes"]
+    names = ["y", "cornell-glass-64", "cornell-glass-64 oidn", "reference"]
+    assert [image["name"] for image in scene["images"]] == names
+    assert scene["images"][2]["note"] == "relative L2 0"
+    assert opened == [page.resolve().as_uri()]
+    small = write(tmp_path / "small.exr", layer("", noise(0, 9, 9, 3)))
+    for arguments, message in (
+        (
+            [GLASS, small],
+            r"small\.exr is \(9, 9, 3\), .*glass-64\.exr is \(64, 64, 3\)",
+        ),
+        ([small, "--reference", GLASS], r"small\.exr is \(9, 9, 3\)"),
+        ([GLASS, "--maps", "ssim"], "--maps ssim: expected some of flip, hdr-flip"),
+        ([GLASS, "--tev", "here:there"], "--tev here:there: expected HOST"),
+        ([], "view needs an image"),
+    ):
+        status, _, error = jscomb("view", *arguments, "-o", tmp_path / "no.html")
+        assert status == 2
+        assert re.search(message, error)
+    assert not (tmp_path / "no.html").exists()
 
 
 def test_info(jscomb, tmp_path):
@@ -221,7 +337,7 @@ def test_errors_are_over_the_same_pixels(jscomb, tmp_path, glass_frame):
         ),
         (["demo", "--nope"], "--nope"),
         (["frobnicate"], "frobnicate"),
-        ([], "demo, render, combine, compare, info"),
+        ([], "demo, render, combine, compare, view, info"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_too(jscomb, arguments, message):
@@ -231,8 +347,31 @@ def test_a_wrong_command_line_is_one_line_too(jscomb, arguments, message):
     assert message in error
 
 
+def test_a_wrong_option_is_said_once(jscomb):
+    _, _, error = jscomb("demo", "--nope")
+    assert error.count("--nope") == 1
+    assert error.lower().count("unrecognized options") == 1
+
+
+def test_version(jscomb):
+    status, out, _ = jscomb("--version")
+    assert (status, out) == (
+        0,
+        f"jscomb {package.__version__}, JAX {jax.__version__}\n",
+    )
+    assert "--version" in jscomb("--help")[1]
+
+
 def test_help_reads_well(jscomb):
-    for command in ((), ("demo",), ("render",), ("combine",), ("compare",), ("info",)):
+    for command in (
+        (),
+        ("demo",),
+        ("render",),
+        ("combine",),
+        ("compare",),
+        ("view",),
+        ("info",),
+    ):
         status, out, _ = jscomb(*command, "--help")
         assert status == 0
         assert "usage: jscomb" in out

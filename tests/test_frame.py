@@ -86,6 +86,13 @@ def test_variance_of_the_mean_from_single_image_or_spread():
         _ = make_frame(x[0]).variance
 
 
+def test_variance_of_one_channel_is_that_of_each():
+    x, v = random(0, 2, *SHAPE), random(1, *SHAPE[:2], 1)
+    for variance in (v, np.stack([2 * v, 2 * v])):
+        found = make_frame(x, variance=variance).variance
+        np.testing.assert_allclose(found, np.broadcast_to(v, SHAPE))
+
+
 @pytest.mark.parametrize("k", [2, 4])
 def test_variance_from_the_spread_is_unbiased(k):
     noise = 0.3 * jax.random.normal(jax.random.key(0), (2000, k, 3, 3, 1))
@@ -153,7 +160,8 @@ def test_plain_image_is_a_frame():
         ({"color": np.ones((0, 5, 3))}, "at least one pixel"),
         ({"color": np.ones((3, *SHAPE))}, "even number of sub-buffers, got 3"),
         ({"variance": np.ones((4, 4, 5, 3))}, r"variance has shape \(4, 4, 5, 3\)"),
-        ({"variance": np.ones((4, 5, 1))}, "variance has shape"),
+        ({"variance": np.ones((4, 5, 2))}, "variance has shape"),
+        ({"color": np.ones((7, 2, *SHAPE))}, "for a batch of frames map make_frame by"),
         ({"albedo": np.ones((4, 6, 3))}, r"albedo has shape .*\(2, 4, 5, 3\)"),
         ({"depth": np.ones(SHAPE)}, r"depth has shape .*\(1, 4, 5, 1\) or"),
         ({"estimates": {"nlm": np.ones((4, 5, 1))}}, "estimate 'nlm' has shape"),

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jscomb.numerics import guards, luminance
+from jscomb import james_stein, metrics
+from jscomb.denoisers import bilateral, nonlocal_means, rdfc, smoothing
+from jscomb.numerics import (
+    guards,
+    kernels,
+    luminance,
+    regression,
+    sure,
+    weights,
+    windows,
+)
 
 
 @pytest.mark.parametrize("d", [1e-30, 1e-8, 1.0, 1e18])
@@ -132,6 +142,66 @@ def test_shapes_are_named():
         guards.check_same_shape(color=jnp.ones((2, 3, 3)), noise=jnp.ones((2, 3, 1)))
     with pytest.raises(ValueError, match=r"color must have shape \[H, W, C\]"):
         guards.check_same_shape(color=jnp.ones((2, 3)))
+
+
+def test_one_channel_is_told_how_to_repeat():
+    message = r"broadcast_to\(noise, color.shape\) repeats its channel"
+    with pytest.raises(ValueError, match=message):
+        guards.check_same_shape(color=jnp.ones((2, 3, 3)), noise=jnp.ones((2, 3, 1)))
+
+
+x = jnp.ones((6, 5, 3))
+OF_IMAGES = {
+    "james_stein.combine": lambda x, window: james_stein.combine(
+        x, x, x, window=window
+    ),
+    "bilateral": lambda x, window: bilateral.denoise(x, x, x, window=window),
+    "nonlocal means": lambda x, window: nonlocal_means.denoise(x, x, x, window=window),
+    "their patch": lambda x, window: nonlocal_means.denoise(x, x, x, patch=window),
+    "rdfc": lambda x, window: rdfc.denoise(x, x, x, x, window=window),
+    "box": lambda x, window: smoothing.box(x, window=window),
+    "window_sum": windows.window_sum,
+    "window_max": windows.window_max,
+    "weighted_mean": lambda x, window: weights.weighted_mean(
+        x, weights.feature_weights(x), window=window
+    ),
+    "kernel_mean": lambda x, window: kernels.kernel_mean(
+        x, jnp.ones((6, 5, 9)), window
+    ),
+}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", OF_IMAGES)
+def test_a_batch_and_several_windows_say_what_helps(name):
+    """Instead of what goes wrong inside."""
+    function = OF_IMAGES[name]
+    with pytest.raises(ValueError, match=r"\(2, 6, 5, 3\): for a batch .* jax.vmap"):
+        function(jnp.stack([x, x]), 3)
+    static = "window is static: .* Static are the options .* loop in Python"
+    for mapped in (jax.vmap, jax.jit):
+        with pytest.raises(ValueError, match=static):
+            mapped(lambda window: function(x, window))(jnp.array([3, 5]))
+    assert jax.vmap(lambda x: function(x, 3))(jnp.stack([x, x])).shape == (2, 6, 5, 3)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_other_static_options_are_named():
+    fit = lambda stride: regression.local_linear(x, x, x, 1.0, window=5, stride=stride)
+    risk = lambda probes: sure.monte_carlo_sure(
+        jax.random.key(0), lambda x: x, x, x, probes=probes
+    )
+    for name, function in {"stride": fit, "probes": risk}.items():
+        with pytest.raises(ValueError, match=f"{name} is static: it must be"):
+            jax.vmap(function)(jnp.array([1, 2]))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_every_metric_says_vmap():
+    batch = jnp.stack([x, x])
+    for metric in (metrics.rel_l2, metrics.rmse, metrics.smape, metrics.ssim):
+        with pytest.raises(ValueError, match="for a batch of images map"):
+            metric(batch, batch)
 
 
 def test_this_jax_adds_up():

@@ -15,6 +15,7 @@ import pytest
 from jscomb import cli, exr
 from jscomb.frame import Estimate
 from tests.battery.public import slug
+from tests.test_exr import layer, write
 
 ROOT = pathlib.Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -73,6 +74,10 @@ def reader(tmp_path, monkeypatch, glass_frame):
     leaking = lambda image: (image + np.roll(image, 1, -2) + np.roll(image, 1, -3)) / 3
     photons = Estimate(leaking(frame.color), leaking(halves_of(frame)))
     exr.write_frame(tmp_path / "p.exr", frame._replace(estimates={"photons": photons}))
+    (tmp_path / "frames").mkdir()
+    exr.write_frame(tmp_path / "frames" / "001.exr", frame)
+    for seed, half in enumerate(frame.halves()):
+        as_blender_writes(tmp_path / f"seed{seed}.exr", half)
     monkeypatch.chdir(tmp_path)
     with (
         jax.enable_x64(False),
@@ -81,6 +86,22 @@ def reader(tmp_path, monkeypatch, glass_frame):
         jax.debug_key_reuse(False),
     ):
         yield tmp_path
+
+
+def as_blender_writes(path, frame):
+    """A view layer with denoising data, of a denoised rendering."""
+    parts = {
+        "Combined": (frame.estimates["oidn"].image, "RGB"),
+        "Noisy Image": (frame.color, "RGB"),
+        "Denoising Albedo": (frame.albedo, "RGB"),
+        "Denoising Normal": (frame.normal, "XYZ"),
+        "Denoising Depth": (frame.depth, "Z"),
+    }
+    channels = {}
+    for name, (image, letters) in parts.items():
+        channels |= layer(f"View Layer.{name}", np.asarray(image), letters)
+    samples = {"cycles.View Layer.samples": f"{float(frame.samples):.0f}"}
+    write(path, channels, **samples)
 
 
 def halves_of(frame):
@@ -131,13 +152,14 @@ def test_command_exists(words, monkeypatch):
     [
         each
         for each in commands()
-        if each.values[0][:2] in (["jscomb", "info"], ["jscomb", "compare"])
+        if each.values[0][:2] in [["jscomb", c] for c in ("info", "compare", "view")]
         or {"--method", "whitened"} <= set(each.values[0])
     ],
 )
 def test_command_runs(words, jscomb, reader):
     frame = exr.read_frame(reader / "frame.exr")
-    exr.write_image(reader / "out.exr", frame.color)
+    for name in ("out", "combined"):
+        exr.write_image(reader / f"{name}.exr", frame.color)
     status, out, error = jscomb(*words[1:])
     assert (status, error) == (0, "")
     assert out

@@ -32,6 +32,7 @@ ROOMS = [
     "methods",
     "exr",
     "plots",
+    "viewer",
     "rendering",
     "cli",
     "__main__",

@@ -11,6 +11,8 @@ from tests.statistics import assert_mean
 from tests.test_windows import near
 
 PURE = [*map(jax.jit, (metrics.rel_l2, metrics.rmse, metrics.smape, metrics.dssim))]
+# Of these more is better.
+ALL = [*PURE, *map(jax.jit, (metrics.psnr, metrics.ssim))]
 
 
 @pytest.fixture
@@ -29,9 +31,31 @@ def test_definitions(pair):
         np.sqrt(np.mean(d**2)),
         np.mean(np.abs(d) / (np.abs(a) + np.abs(r) + 0.001)),
         np.mean((1 - ssim_loops(a, r)) / 2),
+        -10 * np.log10(np.mean(np.square(shown(a) - shown(r)))),
+        np.mean(ssim_loops(a, r)),
     ]
-    for metric, value in zip(PURE, expected, strict=True):
+    for metric, value in zip(ALL, expected, strict=True):
         np.testing.assert_allclose(metric(*pair), value, rtol=1e-9)
+    errors = np.mean(d**2, axis=-1, keepdims=True) / (grey**2 + 0.01)
+    np.testing.assert_allclose(metrics.rel_l2_map(*pair), errors, rtol=1e-9)
+
+
+def shown(image):
+    """Display values by the definition of both curves."""
+    x = np.maximum(image, 0)
+    x = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
+    return np.where(x > 0.0031308, 1.055 * x ** (1 / 2.4) - 0.055, 12.92 * x)
+
+
+def test_equal_images_are_as_good_as_can_be(pair):
+    """And their gradients are finite, also of black ones."""
+    _, r = pair
+    assert metrics.psnr(r, r) == np.inf
+    np.testing.assert_allclose(metrics.ssim(r, r), 1, rtol=1e-12)
+    for metric in (metrics.psnr, metrics.ssim):
+        gradient = jax.jit(jax.grad(metric))
+        assert np.isfinite(gradient(r, r)).all()
+        assert np.isfinite(gradient(0 * r, 0 * r)).all()
 
 
 def ssim_loops(a, r):
@@ -62,7 +86,7 @@ def test_zero_for_equal_images_with_finite_gradient(metric, pair):
     assert np.isfinite(gradient(black, black)).all()
 
 
-@pytest.mark.parametrize("metric", PURE)
+@pytest.mark.parametrize("metric", ALL)
 def test_gradients_and_transforms(metric, pair):
     check_grads(metric, pair, order=1, modes=("rev",), rtol=1e-4)
     batch = [jnp.stack([i, 2 * i]) for i in pair]
@@ -71,7 +95,7 @@ def test_gradients_and_transforms(metric, pair):
     )
 
 
-@pytest.mark.parametrize("metric", PURE)
+@pytest.mark.parametrize("metric", ALL)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_pixel_that_is_not_finite_is_never_hidden(metric, pair, value):
     a, r = pair
@@ -172,7 +196,7 @@ def test_tone_map_is_monotone_and_finite():
 @pytest.mark.usefixtures("unchecked")
 def test_shapes_are_named(pair):
     a, r = pair
-    for metric in PURE:
+    for metric in (*ALL, metrics.rel_l2_map):
         with pytest.raises(ValueError, match="reference has shape"):
             metric(a, r[:-1])
     with pytest.raises(ValueError, match="half_difference has shape"):
@@ -185,6 +209,13 @@ def test_flip(glass_frame):
         better, worse = flip(image, reference), flip(glass_frame.color, reference)
         assert 0 < better < worse < 1
     assert metrics.flip(reference, reference) < 1e-6
+    # The worst pixels are where the image is wrong.
+    wrong = reference.at[10:20, 30:40].multiply(2)
+    for error_map in (metrics.flip_map, metrics.hdr_flip_map):
+        errors = error_map(wrong, reference)
+        assert errors.shape == (64, 64, 1)
+        assert errors[10:20, 30:40].mean() > 0.1
+        assert np.max(errors[40:]) < 1e-6
 
 
 def test_flip_is_guarded(pair):

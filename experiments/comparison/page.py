@@ -1,15 +1,12 @@
 """One page to look at: the table of all combiners, the plots, and the images.
 
-Of what `comparison.sweep` measured. The page holds everything that it shows, needs no
-server and no network, and its viewer flips and slides between images, with zoom, pan
-and exposure in common, beside maps of their errors.
+Of what `comparison.sweep` measured. The page holds everything that it shows, and needs
+no server and no network.
 """
 
-import base64
 import dataclasses
 import html
 import io
-import json
 import pathlib
 from collections.abc import Container
 from typing import Any
@@ -17,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
-import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -26,13 +22,11 @@ from experiments.common.command import tool
 from experiments.comparison import convergence, equal_time, pareto
 from experiments.comparison.combiners import combiners
 from experiments.comparison.sweep import Record, results
-from jscomb import exr, methods, metrics
+from jscomb import exr, methods, viewer
 from jscomb.frame import Frame
 from jscomb.typing import Image
 
 TEMPLATE = pathlib.Path(__file__).with_suffix(".html")
-ERRORS = (1e-4, 1e0)  # relative squared error from black to white
-_MOST = 65504.0  # the largest half float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,29 +58,15 @@ class Config:
     quick: bool = False
 
 
-def encoded(image: Image) -> str:
-    """Half floats, row by row, as base64.
-
-    Args:
-        image: linear radiance or another quantity, [H,W,C].
-
-    Returns:
-        the text; values beyond the largest half float are cut.
-    """
-    values = np.clip(np.asarray(image, np.float32), -_MOST, _MOST)
-    return base64.b64encode(values.astype("<f2").tobytes()).decode()
-
-
-def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
-    """A frame's images and errors, as the page's viewer reads them.
+def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> viewer.Scene:
+    """A frame's images, and of the tiers the map of the estimated error.
 
     Args:
         path: EXR file with a reference.
         combiners: names of `experiments.comparison.combiners`.
 
     Returns:
-        name, width, height, images by name as text, relative L2 by name; of the tiers
-        also the map of the estimated error, as text.
+        the scene, of normalised radiance.
 
     Raises:
         ValueError: if the frame has no reference, or no denoised image.
@@ -101,25 +81,10 @@ def shown(path: pathlib.Path, combiners: tuple[str, ...]) -> dict:
         name: made[name].estimate.image if name in made else _made(frame, name)
         for name in combiners
     }
-    assert frame.reference is not None
-    r, noise = frame.reference
-    measured = {
-        n: metrics.rel_l2(i, r, half_difference=noise) for n, i in images.items()
-    }
-    images["reference"] = r
-    height, width, _ = r.shape
-    return {
-        "name": path.stem,
-        "width": width,
-        "height": height,
-        "images": {name: encoded(image) for name, image in images.items()},
-        "errors": {name: float(error) for name, error in measured.items()},
-        "estimated": {
-            name: encoded(tier.error.map)
-            for name, tier in made.items()
-            if tier.error is not None
-        },
-    }
+    known = {n: tier.error.map for n, tier in made.items() if tier.error is not None}
+    return viewer.make_scene(
+        path.stem, images, reference=frame.reference, maps={"estimated": known}
+    )
 
 
 def _made(frame: Frame, name: str) -> Image:
@@ -189,7 +154,7 @@ def _svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def page(records: list[Record], frames: list[dict], metric: str) -> str:
+def page(records: list[Record], frames: list[viewer.Scene], metric: str) -> str:
     """The whole page.
 
     Args:
@@ -209,15 +174,12 @@ def page(records: list[Record], frames: list[dict], metric: str) -> str:
         " in units of one denoising. Marked: what nothing cheaper is as good as."
     )
     # The curves of what is shown: of all combiners they could not be told apart.
-    drawn = plots(records, metric, combiners=frames[0]["images"])
+    drawn = plots(records, metric, combiners=frames[0].images)
     parts = {
         "about": html.escape(about),
         "table": table(pareto.rows_of(records, metric)),
         "plots": "\n".join(f"<figure>{svg}</figure>" for svg in drawn),
-        "low": f"{ERRORS[0]:g}",
-        "high": f"{ERRORS[1]:g}",
-        # Inside a script element only this could end it.
-        "data": json.dumps(frames).replace("</", "<\\/"),
+        "viewer": viewer.element(frames, address=True),
     }
     text = TEMPLATE.read_text()
     for name, part in parts.items():

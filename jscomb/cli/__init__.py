@@ -1,4 +1,4 @@
-"""The command `jscomb`: render, combine, compare and describe frames, and train.
+"""The command `jscomb`: render, combine, compare, view and describe frames, and train.
 
 Errors of the input are one line on standard error and exit status 2.
 """
@@ -15,10 +15,11 @@ from typing import Any
 import jax
 import tyro
 
+import jscomb
 from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
 from jscomb.cli._rendering import render, render_file
-from jscomb.cli._showing import compare, demo, info
+from jscomb.cli._showing import demo, info
 from jscomb.cli._training import (
     Run,
     prepare,
@@ -27,6 +28,7 @@ from jscomb.cli._training import (
     train_files,
     with_bases,
 )
+from jscomb.cli._viewing import compare, view
 
 __all__ = [
     "Run",
@@ -41,6 +43,9 @@ __all__ = [
 
 def main() -> None:
     """Run the command; the entry point of `jscomb`."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"jscomb {jscomb.__version__}, JAX {jax.__version__}")
+        return
     _use_compilation_cache()
     try:
         _parse()()
@@ -72,16 +77,19 @@ def _parse() -> Callable[[], None]:
             return tyro.extras.subcommand_cli_from_dict(
                 {
                     c.__name__: later(c)
-                    for c in (demo, render, combine, compare, info, train)
+                    for c in (demo, render, combine, compare, view, info, train)
                 },
                 prog="jscomb",
-                description="Combine unbiased and biased Monte Carlo renderings.",
+                description="Combine unbiased and biased Monte Carlo renderings. "
+                "--version prints the version.",
             )
     except SystemExit as end:
         if not end.code:
             raise  # --help
         text = re.sub(r"\x1b\[[0-9;]*m|[^\x00-\x7f]", " ", said.getvalue())
-        raise ValueError(text.replace("-" * 8, "")) from None
+        text = " ".join(text.replace("-" * 8, "").split())
+        # The heading of its message is the message's first words, too.
+        raise ValueError(re.sub(r"^(\w+ \w+) (?=\1)", "", text)) from None
 
 
 def _use_compilation_cache() -> None:

@@ -1,4 +1,4 @@
-"""`jscomb demo`, `compare` and `info`."""
+"""`jscomb demo` and `info`."""
 
 import functools
 import os
@@ -11,13 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jscomb import exr, methods, metrics
+from jscomb import exr, methods
 from jscomb.cli import _tables as tables
 from jscomb.cli._combining import FramePath, SampleCount, by_tier
 from jscomb.denoisers import oidn
 from jscomb.exr import dialects
-from jscomb.frame import Frame, Reference
-from jscomb.numerics.guards import finite
+from jscomb.frame import Frame
 from jscomb.typing import Image
 
 TIMED_RUNS = 7
@@ -61,42 +60,6 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     picture = out / "comparison.png"
     plots.comparison(picture, shown)
     print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
-
-
-def compare(image: FramePath, reference: FramePath, /) -> None:
-    """Print the errors of an image against a reference.
-
-    Args:
-        image: EXR file; its colour is compared.
-        reference: EXR file; the reference in it if it is a frame that has one, else
-            its colour.
-    """
-    a, frame = exr.read_image(image), exr.read_frame(reference, statistics=False)
-    truth = frame.reference or Reference(frame.color)
-    r, noise = truth
-    if a.shape != r.shape:
-        raise ValueError(f"{image} is {a.shape}, {reference} is {r.shape}")
-    mask = finite(a, r)
-    excluded = int((~mask).sum())
-    if excluded == mask.size:
-        raise ValueError(f"{image} and {reference} have no finite pixel in common")
-    rows: dict[str, Any] = {"relative L2": metrics.rel_l2(a, r, mask=mask)}
-    if noise is not None:
-        rows["relative L2, less the reference's noise"] = metrics.rel_l2(
-            a, r, mask=mask, half_difference=noise
-        )
-    rows["RMSE"] = metrics.rmse(a, r, mask=mask)
-    rows["SMAPE"] = metrics.smape(a, r, mask=mask)
-    rows["DSSIM"] = metrics.dssim(a, r, mask=mask)
-    for name, measure in (("FLIP", metrics.flip), ("HDR-FLIP", metrics.hdr_flip)):
-        try:
-            rows[name] = measure(a, r)
-        except (ValueError, ImportError, RuntimeError) as error:
-            print(f"{name:>40}  skipped: {error}")
-    for name, value in rows.items():
-        print(f"{name:>40}  {float(value):.6g}")
-    if excluded:
-        print(f"{excluded} of {mask.size} pixels are not finite and were excluded")
 
 
 def info(frame: FramePath, /, *, samples: SampleCount = None) -> None:

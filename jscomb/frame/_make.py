@@ -15,6 +15,8 @@ from jscomb.frame._frame import (
     expect,
 )
 
+_BATCH = ": for a batch of frames map make_frame by jax.vmap"
+
 
 def make_frame(
     color: ArrayLike,
@@ -33,7 +35,7 @@ def make_frame(
     Args:
         color: radiance, [K,H,W,C] sub-buffers, or one image [H,W,C]. K is 1 or even.
         variance: of the mean of each sub-buffer, [K,H,W,C]; or one image [H,W,C], the
-            variance of the mean of all of them.
+            variance of the mean of all of them. One channel is that of each.
         albedo: [K,H,W,3] or [H,W,3]; this and the other features are optional, and one
             image is shared by all sub-buffers.
         normal: [K,H,W,3] or [H,W,3].
@@ -64,6 +66,8 @@ def make_frame(
         variance = jnp.asarray(variance)
         if variance.ndim == 3:
             variance = jnp.broadcast_to(k * variance, (k, *variance.shape))
+        if variance.shape == (*color.shape[:-1], 1):
+            variance = jnp.broadcast_to(variance, color.shape)
         expect("variance", variance, [(k, *shape)])
     given = {
         "albedo": albedo,
@@ -109,7 +113,7 @@ def _stacked(name: str, buffer: ArrayLike) -> Array:
     if array.ndim not in (3, 4) or array.size == 0:
         raise ValueError(
             f"{name} must have shape [H,W,C] or [K,H,W,C] and at least one pixel, "
-            f"got {array.shape}"
+            f"got {array.shape}" + _BATCH * (array.ndim == 5)
         )
     return array if array.ndim == 4 else array[None]
 

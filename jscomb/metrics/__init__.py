@@ -6,12 +6,22 @@ pixels that count, usually `numerics.guards.finite(image, reference)`; report th
 of the others beside the error.
 """
 
-from jscomb.metrics._display import dssim, flip, hdr_flip, tone_map
+from jscomb.metrics._display import (
+    dssim,
+    flip,
+    flip_map,
+    hdr_flip,
+    hdr_flip_map,
+    psnr,
+    ssim,
+    tone_map,
+)
 from jscomb.metrics._errors import (
     Change,
     mean_change,
     rel_l2,
     rel_l2_change,
+    rel_l2_map,
     rmse,
     smape,
 )
@@ -23,11 +33,16 @@ __all__ = [
     "dssim",
     "estimate_error",
     "flip",
+    "flip_map",
     "hdr_flip",
+    "hdr_flip_map",
     "mean_change",
+    "psnr",
     "rel_l2",
     "rel_l2_change",
+    "rel_l2_map",
     "rmse",
     "smape",
+    "ssim",
     "tone_map",
 ]

@@ -1,14 +1,17 @@
 """Errors of the displayed image.
 
-Layout: images [H,W,C], linear radiance, tone mapped here. `dssim` is pure and
-differentiable. `flip` and `hdr_flip` call NVIDIA's evaluator (extra `flip`) in another
-process, because on some input it ends the process.
+Layout: images [H,W,C], linear radiance, tone mapped here. `psnr`, `ssim` and `dssim`
+are pure and differentiable. `flip`, `hdr_flip` and their maps call NVIDIA's evaluator
+(extra `flip`) in another process, because on some input it ends the process.
 """
 
 import importlib.util
 import io
+import os
+import pathlib
 import subprocess
 import sys
+import tempfile
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,8 +25,36 @@ _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
 
-def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
-    """Return the structural dissimilarity (1 - SSIM) / 2 of the displayed images.
+def psnr(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
+    """Return the peak signal-to-noise ratio of the displayed images.
+
+    Both are tone mapped (`tone_map`) first, so that the peak is 1.
+
+    Args:
+        image: linear radiance, shape [H,W,C].
+        reference: linear radiance, shape [H,W,C].
+        mask: pixels that count, shape [H,W,1].
+
+    Returns:
+        the ratio in decibels, -10 log10 of the mean squared error; infinite for equal
+        images, where its derivative is 0.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> grey = jnp.full((4, 4, 1), 0.18)
+        >>> print(f"{psnr(grey, grey):.1f} {psnr(1.1 * grey, grey):.1f}")
+        inf 31.3
+    """
+    a, r = _displayed(mask, image=image, reference=reference)
+    error = mean(jnp.square(a - r), mask)
+    none = error <= 0
+    return jnp.where(none, jnp.inf, -10 * jnp.log10(jnp.where(none, 1.0, error)))
+
+
+def ssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
+    """Return the structural similarity of the displayed images.
 
     Both are tone mapped (`tone_map`) first. Windows are Gaussian (11x11, sigma 1.5)
     and clipped to the image, so any size works.
@@ -34,7 +65,7 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
         mask: pixels that count, also within windows, shape [H,W,1].
 
     Returns:
-        the dissimilarity, 0 for equal images, at most 1.
+        the similarity, 1 for equal images, at least -1.
 
     Raises:
         ValueError: while tracing, if shapes differ.
@@ -43,16 +74,13 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
         >>> import jax
         >>> stripes = jnp.tile(jnp.array([0.1, 0.4]), (8, 4))[..., None]
         >>> for image in (stripes, jnp.full_like(stripes, 0.2)):
-        ...     print(f"{jax.jit(dssim)(image, stripes):.3f}")
-        0.000
-        0.487
+        ...     print(f"{jax.jit(ssim)(image, stripes):.3f}")
+        1.000
+        0.026
 
     Source: Wang et al. 2004, "Image quality assessment".
     """
-    image, reference = counted(mask, image=image, reference=reference)
-    # Tone mapping would show an infinite pixel as white.
-    bad = jnp.where(jnp.isfinite(image) & jnp.isfinite(reference), 0.0, jnp.nan)
-    a, r = tone_map(image) + bad, tone_map(reference)
+    a, r = _displayed(mask, image=image, reference=reference)
 
     def local(i: Image) -> Image:
         return window_mean(i, _SSIM_WINDOW, mask=mask, sigma=_SSIM_SIGMA)
@@ -60,9 +88,39 @@ def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar
     mean_a, mean_r = local(a), local(r)
     var_a, var_r = local(a * a) - mean_a**2, local(r * r) - mean_r**2
     covariance = local(a * r) - mean_a * mean_r
-    ssim = (2 * mean_a * mean_r + _SSIM_C1) * (2 * covariance + _SSIM_C2)
-    ssim /= (mean_a**2 + mean_r**2 + _SSIM_C1) * (var_a + var_r + _SSIM_C2)
-    return mean((1 - ssim) / 2, mask)
+    similar = (2 * mean_a * mean_r + _SSIM_C1) * (2 * covariance + _SSIM_C2)
+    similar /= (mean_a**2 + mean_r**2 + _SSIM_C1) * (var_a + var_r + _SSIM_C2)
+    return mean(similar, mask)
+
+
+def dssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
+    """Return the structural dissimilarity (1 - SSIM) / 2 of the displayed images.
+
+    Args:
+        image: as for `ssim`.
+        reference: as for `ssim`.
+        mask: as for `ssim`.
+
+    Returns:
+        the dissimilarity, 0 for equal images, at most 1.
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> stripes = jnp.tile(jnp.array([0.1, 0.4]), (8, 4))[..., None]
+        >>> print(f"{dssim(jnp.full_like(stripes, 0.2), stripes):.3f}")
+        0.487
+    """
+    return (1 - ssim(image, reference, mask=mask)) / 2
+
+
+def _displayed(mask: Mask | None, **images: Image) -> tuple[Image, ...]:
+    """Display values of a pair of images; not a number where either is not finite."""
+    image, reference = counted(mask, **images)
+    # Tone mapping would show an infinite pixel as white.
+    bad = jnp.where(jnp.isfinite(image) & jnp.isfinite(reference), 0.0, jnp.nan)
+    return tone_map(image) + bad, tone_map(reference)
 
 
 def tone_map(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -110,7 +168,7 @@ def flip(image: ArrayLike, reference: ArrayLike) -> float:
 
     Source: Andersson et al. 2020.
     """
-    return _run_flip(image, reference, "LDR")
+    return float(flip_map(image, reference).mean())
 
 
 def hdr_flip(image: ArrayLike, reference: ArrayLike) -> float:
@@ -137,6 +195,52 @@ def hdr_flip(image: ArrayLike, reference: ArrayLike) -> float:
 
     Source: Andersson et al. 2021.
     """
+    return float(hdr_flip_map(image, reference).mean())
+
+
+def flip_map(image: ArrayLike, reference: ArrayLike) -> np.ndarray:
+    """Return the FLIP error of every pixel.
+
+    Args:
+        image: as for `flip`.
+        reference: as for `flip`.
+
+    Returns:
+        the errors in [0, 1], shape [H,W,1].
+
+    Raises:
+        ValueError: as `flip`.
+        ImportError: as `flip`.
+        RuntimeError: as `flip`.
+
+    Example:
+        >>> grey = np.full((16, 16, 3), 0.2)
+        >>> if importlib.util.find_spec("flip_evaluator"):
+        ...     assert flip_map(grey, grey).shape == (16, 16, 1)
+    """
+    return _run_flip(image, reference, "LDR")
+
+
+def hdr_flip_map(image: ArrayLike, reference: ArrayLike) -> np.ndarray:
+    """Return the HDR-FLIP error of every pixel.
+
+    Args:
+        image: as for `hdr_flip`.
+        reference: as for `hdr_flip`.
+
+    Returns:
+        the errors in [0, 1], shape [H,W,1].
+
+    Raises:
+        ValueError: as `hdr_flip`.
+        ImportError: as `hdr_flip`.
+        RuntimeError: as `hdr_flip`.
+
+    Example:
+        >>> grey = np.full((16, 16, 3), 0.2)
+        >>> if importlib.util.find_spec("flip_evaluator"):
+        ...     assert hdr_flip_map(grey, grey).shape == (16, 16, 1)
+    """
     return _run_flip(image, reference, "HDR")
 
 
@@ -144,14 +248,14 @@ _FLIP_PROGRAM = """
 import io, sys
 import flip_evaluator, numpy
 data = numpy.load(io.BytesIO(sys.stdin.buffer.read()))
-_, error, _ = flip_evaluator.evaluate(
+errors, *_ = flip_evaluator.evaluate(
     data["reference"], data["image"], sys.argv[1], inputsRGB=sys.argv[1] == "LDR",
-    applyMagma=False)
-print("FLIP", repr(float(error)))
+    applyMagma=False, computeMeanError=False)
+numpy.save(sys.argv[2], errors)
 """
 
 
-def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> float:
+def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> np.ndarray:
     """Validate and evaluate in another process."""
     arrays = {"image": np.asarray(image), "reference": np.asarray(reference)}
     for name, array in arrays.items():
@@ -169,14 +273,18 @@ def _run_flip(image: ArrayLike, reference: ArrayLike, dynamic_range: str) -> flo
     payload = io.BytesIO()
     clipped = {n: np.maximum(np.asarray(a, np.float32), 0) for n, a in arrays.items()}
     np.savez(payload, **clipped)  # type: ignore[arg-type]
-    done = subprocess.run(
-        [sys.executable, "-c", _FLIP_PROGRAM, dynamic_range],
-        input=payload.getvalue(),
-        capture_output=True,
-        check=False,
-    )
-    *_, word, value = (done.stdout.decode(errors="replace").split() or ["", ""])[-2:]
-    if done.returncode or word != "FLIP":
-        output = (done.stdout + done.stderr).decode(errors="replace").strip()
-        raise RuntimeError(f"the FLIP evaluator failed ({done.returncode}): {output}")
-    return float(value)
+    with tempfile.TemporaryDirectory() as folder:
+        made = pathlib.Path(folder, "errors.npy")
+        done = subprocess.run(
+            [sys.executable, "-c", _FLIP_PROGRAM, dynamic_range, os.fspath(made)],
+            input=payload.getvalue(),
+            capture_output=True,
+            check=False,
+        )
+        if done.returncode or not made.exists():
+            output = (done.stdout + done.stderr).decode(errors="replace").strip()
+            raise RuntimeError(
+                f"the FLIP evaluator failed ({done.returncode}): {output}"
+            )
+        height, width, _ = arrays["image"].shape
+        return np.load(made).reshape(height, width, 1)

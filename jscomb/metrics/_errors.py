@@ -55,6 +55,33 @@ def rel_l2(
     return mean(square / (grey_square(reference) + epsilon), mask)
 
 
+def rel_l2_map(
+    image: Image, reference: Image, *, epsilon: float = 0.01
+) -> Float[Array, "h w 1"]:
+    """Return the relative squared error of every pixel, whose mean is `rel_l2`.
+
+    Args:
+        image: a, linear radiance, shape [H,W,C].
+        reference: r, linear radiance, shape [H,W,C].
+        epsilon: squared radiance that limits the weight of black pixels.
+
+    Returns:
+        the mean over channels of (a-r)^2 / (mean_rgb(r)^2 + epsilon), shape [H,W,1].
+
+    Raises:
+        ValueError: while tracing, if shapes differ.
+
+    Example:
+        >>> image = jnp.array([[[1.1], [2.0]]])
+        >>> errors = rel_l2_map(image, jnp.ones((1, 2, 1)))
+        >>> print([f"{error:.4f}" for error in errors.ravel()])
+        ['0.0099', '0.9901']
+    """
+    check_same_shape(image=image, reference=reference)
+    square = jnp.mean(jnp.square(image - reference), axis=-1, keepdims=True)
+    return square / (grey_square(reference) + epsilon)
+
+
 class Change(NamedTuple):
     """An estimated change of an error.
 

@@ -16,8 +16,10 @@ from jaxtyping import Array, Bool, Float
 from jscomb.typing import Image, Mask
 
 __all__ = [
+    "check_image",
     "check_not_negative",
     "check_same_shape",
+    "check_static",
     "divide",
     "finite",
     "first_finite",
@@ -41,20 +43,78 @@ def check_same_shape(**images: Float[Array, "..."]) -> None:
         ValueError: while tracing; names the array that differs and both shapes.
 
     Example:
-        >>> check_same_shape(x=jnp.zeros((2, 2, 3)), y=jnp.zeros((2, 2, 1)))
+        >>> check_same_shape(x=jnp.zeros((2, 2, 3)), y=jnp.zeros((2, 3, 3)))
         Traceback (most recent call last):
             ...
-        ValueError: y has shape (2, 2, 1), x has (2, 2, 3)
+        ValueError: y has shape (2, 3, 3), x has (2, 2, 3)
     """
     (first, image), *_ = images.items()
-    if image.ndim != 3 or image.size == 0:
+    check_image(**{first: image})
+    if image.size == 0:
         raise ValueError(
             f"{first} must have shape [H, W, C], at least one pixel; got {image.shape}"
         )
     for name, other in images.items():
         if other.shape != image.shape:
+            repeat = f": jnp.broadcast_to({name}, {first}.shape) repeats its channel"
+            one = other.shape == (*image.shape[:2], 1)
+            what = f"{name} has shape {other.shape}, {first} has {image.shape}"
+            raise ValueError(what + repeat * one)
+
+
+def check_image(**images: Float[Array, "..."]) -> None:
+    """Raise unless every array is one image [H,W,C]; a batch is told of `vmap`.
+
+    Args:
+        images: arrays by the names that the user knows.
+
+    Returns:
+        nothing.
+
+    Raises:
+        ValueError: while tracing; names the array and its shape.
+
+    Example:
+        >>> check_image(x=jnp.zeros((5, 2, 2, 3)))  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+            ...
+        ValueError: x must have shape [H, W, C], got (5, 2, 2, 3): for a batch of ...
+    """
+    for name, image in images.items():
+        if image.ndim != 3:
+            batch = ": for a batch of images map the function by jax.vmap"
+            what = f"{name} must have shape [H, W, C], got {image.shape}"
+            raise ValueError(what + batch * (image.ndim == 4))
+
+
+def check_static(**options: object) -> None:
+    """Raise if an option that decides a program is traced, as by `vmap` over it.
+
+    Args:
+        options: by the names that the user knows.
+
+    Returns:
+        nothing.
+
+    Raises:
+        ValueError: names the option, and says which options are static.
+
+    Example:
+        >>> import jax
+        >>> try:
+        ...     jax.jit(lambda window: check_static(window=window))(3)
+        ... except ValueError as error:
+        ...     print(str(error)[:44])
+        window is static: it must be a Python number
+    """
+    for name, option in options.items():
+        if isinstance(option, Tracer):
             raise ValueError(
-                f"{name} has shape {other.shape}, {first} has {image.shape}"
+                f"{name} is static: it must be a Python number, not an array that vmap "
+                "or jit traces. Static are the options that set shapes and loops "
+                "(widths such as window and patch, stride, scales, probes) and those "
+                "that choose (whiten, names); for several of them loop in Python. "
+                "Images, scales of them, strengths and thresholds may be traced"
             )
 
 

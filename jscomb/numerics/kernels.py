@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import weighted_ratio
+from jscomb.numerics.guards import check_image, weighted_ratio
 from jscomb.numerics.tiles import map_rows
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Mask
@@ -74,6 +74,7 @@ def kernel_mean(
         >>> print(kernel_mean(image, left, 3)[0, :, 0])
         [0. 1. 2.]
     """
+    check_image(image=image)
     h, w, _ = image.shape
     r = check_window(window) // 2
     if weights.shape != (h, w, window**2):

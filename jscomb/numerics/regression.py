@@ -44,7 +44,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics import cholesky
-from jscomb.numerics.guards import check_same_shape, weighted_ratio, zero_invalid
+from jscomb.numerics.guards import (
+    check_same_shape,
+    check_static,
+    weighted_ratio,
+    zero_invalid,
+)
 from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
 from jscomb.numerics.weights import Weights, gaussian_weights, tile_weights
 from jscomb.numerics.windows import check_window, window_max, window_min
@@ -287,6 +292,7 @@ def _grid(window: int, stride: int) -> Grid:
     A quarter of the reach is spare, for when the pixel in the middle is invalid.
     """
     reach = check_window(window) // 2
+    check_static(stride=stride)
     maximum = reach + 1
     if not 1 <= stride <= maximum:
         raise ValueError(

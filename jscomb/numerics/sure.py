@@ -33,6 +33,7 @@ from jaxtyping import Array
 from jscomb.numerics.guards import (
     check_not_negative,
     check_same_shape,
+    check_static,
     finite,
     safe_sqrt,
     zero_invalid,
@@ -107,6 +108,7 @@ def monte_carlo_sure(
 
     Source: PD eq. 1, 2, with the exact derivative.
     """
+    check_static(probes=probes, probe=probe)
     if probes < 1:
         raise ValueError(f"probes must be positive, got {probes}")
     if probe not in get_args(Probe):

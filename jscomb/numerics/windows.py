@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from jscomb.numerics.guards import weighted_ratio
+from jscomb.numerics.guards import check_image, check_static, weighted_ratio
 from jscomb.typing import Image, Mask
 
 __all__ = [
@@ -317,7 +317,7 @@ def check_window(window: int) -> int:
         the same width.
 
     Raises:
-        ValueError: while tracing.
+        ValueError: while tracing; also for a window that is traced itself.
 
     Example:
         >>> check_window(4)
@@ -325,6 +325,7 @@ def check_window(window: int) -> int:
             ...
         ValueError: window must be odd and positive, got 4
     """
+    check_static(window=window)
     if window < 1 or window % 2 == 0:
         raise ValueError(f"window must be odd and positive, got {window}")
     return window
@@ -332,6 +333,7 @@ def check_window(window: int) -> int:
 
 def _only(image: Image, mask: Mask | None, neutral: float) -> Image:
     """Return the image with `neutral` at excluded pixels."""
+    check_image(image=image)
     return image if mask is None else jnp.where(mask, image, neutral)
 
 

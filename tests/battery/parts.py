@@ -121,6 +121,9 @@ def parts() -> dict[str, Function]:
         "metrics.rmse": lambda r: metrics.rmse(r.unbiased, r.biased),
         "metrics.smape": lambda r: metrics.smape(r.unbiased, r.biased),
         "metrics.dssim": lambda r: metrics.dssim(r.unbiased, r.biased),
+        "metrics.ssim": lambda r: metrics.ssim(r.unbiased, r.biased),
+        "metrics.psnr": lambda r: metrics.psnr(r.unbiased, r.biased),
+        "metrics.rel_l2_map": lambda r: metrics.rel_l2_map(r.unbiased, r.biased),
         "metrics.rel_l2_change": lambda r: metrics.rel_l2_change(
             jnp.stack(r[2:4]), jnp.stack(r[:2]), jnp.stack(r[:2])
         ),

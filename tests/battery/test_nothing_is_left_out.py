@@ -71,6 +71,7 @@ ELSEWHERE = {
         "progressive.neural_combine",
     },
     "of functions": {
+        "denoisers.black_box",
         "nonlocal_means.weights",
         "sure.exact_sure",
         "uncorrelated.admissibility",

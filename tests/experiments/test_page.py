@@ -1,9 +1,7 @@
 """The page holds what was measured, and its viewer works in a browser, from a file."""
 
-import base64
 import json
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ import pytest
 from experiments.comparison import page as pages
 from tests.conftest import DATA
 from tests.experiments.test_comparison import record
+from tests.test_viewer import Viewer
 
 FEW = ("path tracing", "oidn", "whitened")
 LINES = [
@@ -32,7 +31,7 @@ def page(tmp_path_factory):
     return path
 
 
-def test_page_holds_everything(page, glass_frame):
+def test_page_holds_everything(page):
     text = page.read_text()
     assert "{{" not in text
     assert not re.search(r"(src|href)=\"(?!#)", text)  # nothing from elsewhere
@@ -43,97 +42,29 @@ def test_page_holds_everything(page, glass_frame):
         ("whitened", 0.5),
     }
     assert text.count("<svg") == 3
-    held = pages.encoded(glass_frame.color)
-    image = np.frombuffer(base64.b64decode(held), "<f2").reshape(64, 64, 3)
-    np.testing.assert_allclose(image, glass_frame.color, rtol=1e-3, atol=1e-6)
-    data = re.search(r'id="data" type="application/json">(.*?)</script>', text, re.S)
-    frames = json.loads(data[1])
-    assert list(frames[0]["estimated"]) == ["balanced"]
-    error = np.frombuffer(base64.b64decode(frames[0]["estimated"]["balanced"]), "<f2")
-    assert error.size == 64 * 64
-    true = frames[0]["errors"]["balanced"]
-    assert true / 3 < error.mean() < 3 * true
+    data = re.search(r"data-scenes>(.*?)</script>", text, re.DOTALL)
+    scenes = json.loads(data[1])["scenes"]
+    assert [scene["name"] for scene in scenes] == ["cornell-glass-64", "cornell-box-64"]
+    *images, reference = scenes[0]["images"]
+    assert [image["name"] for image in images] == [*FEW, "balanced"]
+    assert reference["name"] == "reference"
+    assert [list(image["maps"]) for image in images] == [[], [], [], ["estimated"]]
+    assert all(image["note"].startswith("relative L2 ") for image in images)
 
 
-@pytest.fixture(scope="module")
-def browser():
-    """Headless Chromium."""
-    paths = [shutil.which(name) for name in ("chromium", "chromedriver")]
-    if None in paths:
-        pytest.skip("needs Debian's chromium and chromium-driver")
-    webdriver = pytest.importorskip("selenium.webdriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = paths[0]
-    for flag in ("--headless=new", "--no-sandbox", "--window-size=1200,1600"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    service = webdriver.ChromeService(executable_path=paths[1])
-    driver = webdriver.Chrome(options=options, service=service)
-    yield driver
-    driver.quit()
-
-
-def test_viewer_works_in_a_browser(browser, page):
-    from selenium.webdriver import ActionChains
-
+def test_its_viewer_works_in_a_browser(browser, page):
     browser.get(page.as_uri())
-    press = lambda key: ActionChains(browser).send_keys(key).perform()
-    state = lambda: browser.execute_script("return window.viewer")
-    said = lambda: browser.find_element("id", "said").text
-    pixels = lambda id_: browser.execute_script(
-        "const c = document.getElementById(arguments[0]);"
-        "const all = c.getContext('2d').getImageData(0, 0, c.width, c.height);"
-        "return Array.from(all.data)",
-        id_,
+    viewer = Viewer(browser)
+    viewer.press("4")
+    viewer.press("e", pane=1)
+    viewer.press("e", pane=1)
+    assert (
+        viewer.text(".pane:nth-child(2) select:nth-of-type(2)", "value") == "estimated"
     )
-    assert "path tracing: relative L2" in said()
-    noisy, wrong = pixels("image"), pixels("error")
-    assert np.std(noisy) > 0
-    press("2")
-    assert (state()["shown"], state()["before"]) == (1, 0)
-    assert "oidn" in said()
-    assert pixels("image") != noisy
-    assert np.mean(pixels("error")) < np.mean(wrong)  # the denoised one is better
-    press("4")
-    true = pixels("error")
-    press("m")
-    assert "balanced" in said()
-    assert "error as estimated" in said()
-    assert np.std(pixels("error")) > 0
-    assert pixels("error") != true
-    press("m")
-    assert pixels("error") == true
-    press("2")
-    press("5")
-    assert "reference" in said()
-    assert np.max(np.reshape(pixels("error"), (-1, 4))[:, :3]) == 0
-    press("s")
-    assert "left of the line oidn" in said()
-    press("s")
-    before = np.mean(pixels("image"))
-    press("\ue013")  # arrow up: one stop brighter
-    assert state()["stops"] == 1
-    assert np.mean(pixels("image")) > before
-    view = browser.find_element("id", "image")
-    both = [pixels(name) for name in ("image", "error")]
-    press("1")
-    browser.execute_script(
-        "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -400, clientX: 99,"
-        " clientY: 700, cancelable: true}))",
-        view,
-    )
-    assert state()["zoom"] == pytest.approx(np.e)
-    start = state()["x"]
-    ActionChains(browser).click_and_hold(view).move_by_offset(30, 0).release().perform()
-    assert state()["x"] > start
-    assert [pixels(name) for name in ("image", "error")] != both
-    press("e")
-    assert state()["signed"]
-    press("0")
-    assert (state()["zoom"], state()["x"], state()["stops"]) == (1, 0, 0)
-    press("f")
-    assert state()["frame"] == 1
-    assert [e for e in browser.get_log("browser") if e["level"] == "SEVERE"] == []
+    assert np.std(viewer.pixels(1)[..., :3]) > 0
+    viewer.press("n")
+    assert "cornell-box-64" in viewer.address()
+    assert viewer.complaints() == []
 
 
 def test_bad_input(tmp_path):

@@ -11,7 +11,7 @@ from jscomb.denoisers.oidn import _filter, _weights
 from jscomb.denoisers.oidn._models import GUIDES, Model, Quality
 from jscomb.frame import Needs
 from jscomb.numerics.convolution import doubled
-from jscomb.numerics.guards import finite
+from jscomb.numerics.guards import check_image, finite
 from jscomb.numerics.luminance import median_luminance
 from jscomb.numerics.tiles import compiled
 from jscomb.numerics.windows import window_max, window_mean
@@ -216,7 +216,8 @@ def _checked(name: str, image: ArrayLike) -> Array:
     """Return the image in float32, if the filter can denoise it."""
     _check_installed()
     array = jnp.asarray(image, jnp.float32)
-    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+    check_image(**{name: array})
+    if array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"{name} must have shape [H,W,3], got {array.shape}")
     return array
 

@@ -6,7 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import check_same_shape, divide, zero_invalid
+from jscomb.numerics.guards import (
+    check_image,
+    check_same_shape,
+    divide,
+    zero_invalid,
+)
 from jscomb.numerics.weights._pairs import Pairs, Weights
 from jscomb.typing import Scalar
 
@@ -43,6 +48,7 @@ def gaussian_weights(
     """
     if isinstance(bandwidth, int | float) and not bandwidth > 0:
         raise ValueError(f"bandwidth must be positive, got {bandwidth}")
+    check_image(guide=guide)
     h = jnp.asarray(bandwidth, guide.dtype)
     if h.ndim and h.shape != (*guide.shape[:2], 1):
         raise ValueError(f"bandwidth has shape {h.shape}, guide has {guide.shape}")
@@ -127,6 +133,7 @@ def feature_weights(
     """
     if not (strength > 0 and minimum > 0):
         raise ValueError(f"{strength=} and {minimum=} must be positive")
+    check_image(features=features)
     slope = jnp.maximum(sum(_square_slope(features, axis) for axis in (0, 1)), minimum)
     scale = strength**2 * slope
     return Weights(jnp.concatenate([features, scale], axis=-1), _feature_pair)
@@ -172,6 +179,7 @@ def bilateral_weights(
     """
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
+    check_image(guide=guide, noisy=noisy)
     if noisy.shape != variance.shape:
         raise ValueError(f"variance has shape {variance.shape}, noisy {noisy.shape}")
     # Integers, which float32 holds exactly; scaled, large ones would be rounded.

@@ -6,7 +6,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.numerics.guards import first_finite, weighted_ratio, zero_invalid
+from jscomb.numerics.guards import (
+    check_image,
+    first_finite,
+    weighted_ratio,
+    zero_invalid,
+)
 from jscomb.numerics.tiles import (
     Grid,
     Planes,
@@ -62,6 +67,7 @@ def weighted_mean(
         >>> print(weighted_mean(image, even, window=3)[0, :, 0])
         [2.  4.  5.5]
     """
+    check_image(image=image, guide=weights.image)
     valid, clean, guide = zero_invalid(image, weights.image)
     reach, halo = check_window(window) // 2, weights.halo
     tile = min(_TILE, max(image.shape[:2]))
