@@ -47,7 +47,6 @@ from jscomb.double_shrinkage._frame import (
 from jscomb.double_shrinkage._neural import Filters, combine_inputs, neural_combine
 from jscomb.double_shrinkage._prior import blend_prior, radiance_prior
 
-
 __all__ = [
     "NEEDS",
     "Dependence",
