@@ -17,6 +17,7 @@ import tyro
 
 from jscomb import cache, methods, rendering
 from jscomb.cli._combining import combine
+from jscomb.cli._interrupting import ends_on_interrupt
 from jscomb.cli._rendering import render, render_file
 from jscomb.cli._showing import compare, demo, info
 from jscomb.cli._training import (
@@ -43,8 +44,9 @@ def main() -> None:
     """Run the command; the entry point of `jscomb`."""
     _use_compilation_cache()
     try:
-        _parse()()
-        sys.stdout.flush()
+        with ends_on_interrupt():
+            _parse()()
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
