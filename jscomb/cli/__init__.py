@@ -77,6 +77,7 @@ def _parse() -> Callable[[], None]:
                     for c in (demo, render, combine, compare, info, train)
                 },
                 prog="jscomb",
+                args=_as_combine(sys.argv[1:]),
                 description="Combine unbiased and biased Monte Carlo renderings.",
             )
     except SystemExit as end:
@@ -84,6 +85,26 @@ def _parse() -> Callable[[], None]:
             raise  # --help
         text = re.sub(r"\x1b\[[0-9;]*m|[^\x00-\x7f]", " ", said.getvalue())
         raise ValueError(text.replace("-" * 8, "")) from None
+
+
+# What denoisers call their options, and what they are called here.
+_DENOISERS = {"hdr": "", "alb": "--albedo", "nrm": "--normal", "output": "--out"}
+
+
+def _as_combine(arguments: list[str]) -> list[str]:
+    """A command as Open Image Denoise's own tool takes it, as one of ours."""
+    names = [re.sub("^--?", "", a) if a.startswith("-") else "" for a in arguments]
+    if "hdr" in names:
+        words = [
+            _DENOISERS.get(name, argument) if name else argument
+            for name, argument in zip(names, arguments, strict=True)
+        ]
+        rest = [word for word in words if word]
+        return rest if rest[:1] == ["combine"] else ["combine", *rest]
+    if arguments and (names[0] or os.path.exists(arguments[0])):
+        if names[0] not in ("h", "help") and len(arguments) > 1:
+            raise ValueError(f"did you mean: jscomb combine {' '.join(arguments)}")
+    return arguments
 
 
 def _use_compilation_cache() -> None:

@@ -217,18 +217,25 @@ def _combine_job(job: Job, options: Options, limits: Limits) -> None:
         made = _combined(loaded.frame, loaded.biased, options, limits.memory)
     except ValueError as error:
         raise ValueError(f"{job.frame}: {error}{_remedy(loaded.frame)}") from None
-    if made.method == "denoised" and _lacks_noise(loaded.frame):
+    if made.method != options.method and _lacks_noise(loaded.frame):
         print(f"{job.frame}: neither variance nor half buffers{_remedy(loaded.frame)}")
     if job.folder:
         os.makedirs(job.folder, exist_ok=True)
     _write(job, loaded, made, options, made_from)
     of = f" of {', '.join(made.bases)}" if made.bases else ""
     size = tables.size(loaded.frame)
-    print(f"wrote {job.target}: {size}, {made.method}{of}")
+    color = loaded.contents.color
+    where = f", as {color.shown}" if color and color.name and _keeps(options) else ""
+    print(f"wrote {job.target}: {size}, {made.method}{of}{where}")
     if loaded.frame.reference is not None:
         held = {n: estimate.image for n, estimate in loaded.frame.estimates.items()}
         images = {"input": loaded.frame.color, **held, made.method: made.image}
         tables.print_table({"relative L2": tables.errors(images, loaded.frame)})
+
+
+def _keeps(options: Options) -> bool:
+    """Whether the layers of the frame's file are written again."""
+    return options.layers == "all"
 
 
 def _lacks_noise(frame: Frame) -> bool:

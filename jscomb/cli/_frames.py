@@ -121,6 +121,11 @@ def load(sources: Sources, options: Options, max_bytes: int) -> Loaded:
         **common,
     )
     notes = list(contents.notes)
+    if "made from" in contents.provenance and options.layer is None:
+        raise ValueError(
+            f"{job.frame}: is a result of jscomb combine, not a render: combine what it "
+            "was made from"
+        )
     if contents.frame is None:
         raise ValueError(f"{job.frame}: has only a denoised image, no noisy one")
     frame = contents.frame
@@ -206,7 +211,7 @@ def _fitting(frame: Frame, color: Image) -> Frame:
     """The frame without buffers, where its colour had to be moved or converted."""
     if np.array_equal(frame.color, color, equal_nan=True):
         return frame
-    return make_frame(color, samples=frame.samples)
+    return make_frame(color)._replace(samples=frame.samples)
 
 
 def _of_sub_buffers(frame: Frame, frames: list[Frame], colors: list[Image]) -> Frame:

@@ -150,14 +150,19 @@ def info(
     else:
         _print_range("denoised alone", contents.image)
     for name, value in contents.provenance.items():
-        print(f"  made with       {name} = {value}")
+        if name != "made from":
+            print(f"  made with       {name} = {value}")
 
 
 def _print_file(contents: exr.Contents) -> None:
     """Channels, what was taken for what, windows, and what else there is to say."""
     for found in contents.layers:
-        taken = f": {', '.join(found.taken_for)}" if found.taken_for else ""
-        print(f"  channels        {', '.join(found.names)} ({found.kind}){taken}")
+        each = found.taken_for.items()
+        taken = [f"{role} ({', '.join(names)})" for role, names in each]
+        taken = taken if len(taken) > 1 else list(found.taken_for)
+        taken = f": {', '.join(taken)}" if taken else ""
+        part = f"part {found.part}: " if found.part else ""
+        print(f"  channels        {part}{', '.join(found.names)} ({found.kind}){taken}")
     for role, others in contents.rivals.items():
         option = "layer" if role == "color" else role
         also = f"  could be {role}, too: {', '.join(others)}"

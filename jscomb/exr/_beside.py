@@ -14,8 +14,6 @@ from jscomb.exr._layers import Layer, layers_of
 from jscomb.exr.dialects._images import (
     Source,
     Window,
-    clipped,
-    finite_depth,
     placed,
     variance_of_mean,
 )
@@ -49,7 +47,7 @@ def read_feature(
 
     Args:
         path: EXR file, or a `Source` of it.
-        name: of a feature, or variance: the layer that is usually called so, else the
+        name: albedo, normal, or variance: the layer that is usually called so, else the
             file's only or main image.
         samples: samples a pixel, for a variance of single samples.
         max_bytes: as for `read_contents`.
@@ -89,11 +87,10 @@ def read_feature(
             unbiased = unit == "sample"
             stored = f"the variance ({source.path})"
             image = variance_of_mean(image, samples, stored, unbiased=unbiased)
-    image = clipped(image) if name == "albedo" else image
-    image = finite_depth(image) if name == "depth" else image
+    if name == "albedo":
+        image = np.clip(image, 0, 1)
     attributes = part[layer.part].attributes
     windows = (window(attributes, f"{kind}Window") for kind in ("data", "display"))
-    assert image is not None
     return Feature(source.path, image, *windows)
 
 

@@ -29,14 +29,16 @@ class Channels(NamedTuple):
     """A layer of a file, for a list.
 
     Attributes:
+        part: name of the part, where there are several.
         names: of its channels.
         kind: half, float, uint, or several of them.
-        taken_for: roles, such as albedo.
+        taken_for: channels by role, such as albedo.
     """
 
+    part: str
     names: list[str]
     kind: str
-    taken_for: list[str]
+    taken_for: dict[str, list[str]]
 
 
 class Contents(NamedTuple):
@@ -87,7 +89,8 @@ class Contents(NamedTuple):
     def median_luminance(self) -> float:
         """The median of the positive luminances, by the file's own primaries."""
         weights = _color.luminance_weights(self.chromaticities)
-        luminance = np.asarray(self.image, np.float64) @ weights
+        image = self.image if self.frame is None else self.frame.color
+        luminance = np.asarray(image, np.float64) @ weights
         lit = luminance[np.isfinite(luminance) & (luminance > 0)]
         return float(np.median(lit)) if lit.size else 1.0
 
@@ -281,17 +284,20 @@ def _listed(headers: Headers, read: Reading) -> list[Channels]:
     elif read.color is not None:
         for name in read.color.color or []:
             roles[color, name] = ["color"]
+    several = len(headers.types) > 1
     groups: dict[tuple[str, int], list[str]] = {}
     for number, types in enumerate(headers.types):
-        label = headers.parts[number].name if len(headers.types) > 1 else ""
+        label = headers.parts[number].name if several else ""
         for name in types:
             prefix = name.rpartition(".")[0]
             groups.setdefault((prefix or label, number), []).append(name)
     found = []
     for (_, number), names in sorted(groups.items()):
         kinds = {_NAMES[headers.types[number][name]] for name in names}
-        taken = [role for name in names for role in roles.get((number, name), [])]
-        found.append(
-            Channels(names, ", ".join(sorted(kinds)), list(dict.fromkeys(taken)))
-        )
+        taken: dict[str, list[str]] = {}
+        for name in names:
+            for role in roles.get((number, name), []):
+                taken.setdefault(role, []).append(name)
+        part = headers.parts[number].name or str(number) if several else ""
+        found.append(Channels(part, names, ", ".join(sorted(kinds)), taken))
     return found

@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -94,7 +94,7 @@ def read_headers(path: str, *, digest: bool = False) -> Headers:
 
 def read_pixels(
     headers: Headers,
-    wanted: dict[int, Collection[str]] | None = None,
+    wanted: Mapping[int, Collection[str]] | None = None,
     *,
     max_bytes: int = MAX_BYTES,
 ) -> list[Part]:
@@ -258,7 +258,7 @@ def _unreadable(path: str, error: Exception) -> ValueError:
 
 
 def _first_alone(
-    headers: Headers, wanted: dict[int, Collection[str]] | None
+    headers: Headers, wanted: Mapping[int, Collection[str]] | None
 ) -> list[str] | None:
     """The wanted channels, if they are of the first part and can be read alone."""
     some = {number: names for number, names in (wanted or {}).items() if names}
@@ -298,7 +298,7 @@ def _pixels(
     headers: Headers,
     number: int,
     read: Any,
-    wanted: dict[int, Collection[str]] | None,
+    wanted: Mapping[int, Collection[str]] | None,
 ) -> dict[str, np.ndarray]:
     """The wanted channels of a part that was read."""
     names = read.channels.keys() if wanted is None else wanted.get(number, ())
@@ -321,7 +321,7 @@ def _widest(part: Part) -> dict[str, Any]:
 
 
 def _check_claims(
-    headers: Headers, wanted: dict[int, Collection[str]] | None, max_bytes: int
+    headers: Headers, wanted: Mapping[int, Collection[str]] | None, max_bytes: int
 ) -> None:
     """Raise if the file would take too much memory, before any pixel is read."""
     path, claimed = headers.path, 0

@@ -43,7 +43,8 @@ class Layer(NamedTuple):
     @property
     def shown(self) -> str:
         """The layer as users are told of it."""
-        name = self.name or self.part_name or ", ".join(self.channels.values())
+        own = sorted(self.channels, key=lambda each: ("RGBA".find(each) % 9, each))
+        name = self.name or ", ".join(self.channels[letter] for letter in own)
         return f"{name} ({self.view})" if self.view else name
 
     def rank(self, role: str) -> int | None:
@@ -142,15 +143,14 @@ def _without(name: str, view: str) -> str:
 
 
 def _sided(layers: list[Layer]) -> list[Layer]:
-    """Layers of a left and a right image are views, where no attribute says so."""
-    split = [layer.name.partition(".") for layer in layers]
-    if any(layer.view for layer in layers) or not {"left", "right"} <= {
-        first.lower() for first, _, _ in split
-    }:
+    """Layers of a left or a right image are views, where no attribute says so."""
+    sides = {"left", "right"}
+    if any(layer.view for layer in layers) or not any(
+        layer.name.lower() in sides and layer.color for layer in layers
+    ):
         return layers
+    split = [layer.name.partition(".") for layer in layers]
     return [
-        layer._replace(view=first, name=rest)
-        if first.lower() in ("left", "right")
-        else layer
+        layer._replace(view=first, name=rest) if first.lower() in sides else layer
         for layer, (first, _, rest) in zip(layers, split, strict=True)
     ]

@@ -99,17 +99,13 @@ def _samples(parts: list[Part], main: Layer) -> int | float | None:
     for part in [parts[main.part], *parts]:
         attributes = {**part.attributes, **attributes}
     for name in names:
-        if name not in attributes:
-            continue
-        value = attributes[name]
-        is_text = name.startswith("cycles.")
-        try:
-            if not isinstance(value, str if is_text else int | float):
-                raise ValueError
-            return int(value) if is_text else value
-        except ValueError:
-            message = f"attribute {name} is {value!r}, not a number"
-            raise ValueError(message) from None
+        value = attributes.get(name)
+        if isinstance(value, str) and name.startswith("cycles.") and value.isdigit():
+            return int(value)
+        if isinstance(value, int | float) and not name.startswith("cycles."):
+            return value
+        if value is not None:
+            raise ValueError(f"attribute {name} is {value!r}, not a number")
     return None
 
 
@@ -144,5 +140,5 @@ def _variance(
     )
     known = [stored, *(images[n] for n in ("albedo", "normal") if n in images)]
     hit = np.any([np.any(image != 0, axis=-1) for image in known], axis=0)
-    black = ~np.any(images["color"] != 0, axis=-1)
-    return np.where((hit | black)[..., None], variance, np.nan)
+    black = np.all(images["color"] == 0, axis=-1)
+    return np.where(np.logical_or(hit, black)[..., None], variance, np.nan)
