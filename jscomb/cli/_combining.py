@@ -17,7 +17,13 @@ from jscomb import exr, methods, metrics
 from jscomb.cli import _tables as tables
 from jscomb.cli._frames import FEATURES, Job, Loaded, Options, Sources, load
 from jscomb.cli._matching import expand, is_several, match
-from jscomb.cli._outputs import check_folder, check_inputs_stay, state, targets
+from jscomb.cli._outputs import (
+    check_folder,
+    check_inputs_stay,
+    path_from,
+    state,
+    targets,
+)
 from jscomb.frame import Frame
 from jscomb.numerics.tiles import Local, stream_crops, tile_within
 from jscomb.typing import Image
@@ -207,7 +213,7 @@ def _combine_job(job: Job, options: Options, limits: Limits) -> None:
     sources = Sources(job)
     made_from = sources.made_from(options, jscomb.__version__)
     check_inputs_stay([job.target], sources.files())
-    if state(job.target, made_from, force=limits.force) == "done":
+    if state(job.target, job.frame, made_from, force=limits.force) == "done":
         print(f"{job.target} is there already")
         return
     loaded = load(sources, options, limits.max_bytes)
@@ -271,6 +277,7 @@ def _write(
         "jscomb": jscomb.__version__,
         "method": made.method,
         "frame": os.path.basename(os.path.abspath(job.frame)),
+        "path": path_from(job.target, job.frame),
         "biased": made.bases,
         "made from": made_from,
         "input": contents.provenance,

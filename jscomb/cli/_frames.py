@@ -11,6 +11,7 @@ from jscomb.exr import Contents
 from jscomb.frame import CHANNELS, Estimate, Frame, make_frame
 from jscomb.typing import Image
 
+_ROUNDING = 0.02  # of 16 bits, and of filters that differ
 FEATURES = ("albedo", "normal", "variance")
 
 
@@ -123,8 +124,8 @@ def load(sources: Sources, options: Options, max_bytes: int) -> Loaded:
     notes = list(contents.notes)
     if "made from" in contents.provenance and options.layer is None:
         raise ValueError(
-            f"{job.frame}: is a result of jscomb combine, not a render: combine what it "
-            "was made from"
+            f"{job.frame}: is a result of jscomb combine: combine the render that it "
+            "was made of"
         )
     if contents.frame is None:
         raise ValueError(f"{job.frame}: has only a denoised image, no noisy one")
@@ -202,9 +203,24 @@ def _with_halves(
         colors.append(color)
     if len(frames) % 2:
         raise ValueError(
-            f"--halves: {len(frames)} renders; half buffers need an even number"
+            f"--halves: needs an even number of renders with the frame, has "
+            f"{len(frames)}"
         )
+    if not takes_part and own not in paths:
+        _check_mean(job.frame, frame.color, colors)
     return _of_sub_buffers(frame, frames, colors)
+
+
+def _check_mean(path: str, color: Image, colors: list[Image]) -> None:
+    """Raise unless a frame is the mean of its halves, but for rounding."""
+    mean = jnp.mean(jnp.stack(colors), axis=0)
+    known = np.isfinite(mean) & np.isfinite(color)
+    difference = np.abs(np.where(known, mean - color, 0)).mean()
+    if difference > _ROUNDING * np.abs(np.where(known, mean, 0)).mean():
+        raise ValueError(
+            f"--halves: {path} is neither one of the {len(colors)} renders nor their "
+            "mean"
+        )
 
 
 def _fitting(frame: Frame, color: Image) -> Frame:

@@ -4,10 +4,9 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Iterator
-
-from jscomb import exr
 
 STATUS = 128 + signal.SIGINT
 
@@ -42,7 +41,8 @@ def _wait(reader: socket.socket, stderr: int) -> None:
     with reader:
         while received := reader.recv(1):
             if received[0] == signal.SIGINT:
-                exr.discard_unfinished()
+                if files := sys.modules.get("jscomb.exr._files"):
+                    files.discard_unfinished()
                 os.write(stderr, b"jscomb: interrupted\n")
                 os._exit(STATUS)
     os.close(stderr)

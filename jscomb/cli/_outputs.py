@@ -83,12 +83,13 @@ def check_folder(target: str) -> None:
 
 
 def state(
-    target: str, made_from: dict[str, Any], *, force: bool
+    target: str, frame: str, made_from: dict[str, Any], *, force: bool
 ) -> Literal["done", "to do"]:
     """Return whether a target is made already; raise if it must not be replaced.
 
     Args:
         target: file to write.
+        frame: that it is made of.
         made_from: what distinguishes this result from others.
         force: replace anything that is no input.
 
@@ -102,16 +103,25 @@ def state(
     if not os.path.isfile(target):
         raise ValueError(f"{target}: is not a file")
     try:
-        found = exr.read_provenance(target).get("made from")
+        found = exr.read_provenance(target)
     except (ValueError, OSError):
-        found = None
-    before: dict[str, Any] = found if isinstance(found, dict) else {}
-    ours = bool(before) and exr.is_intact(target)
-    if ours and before == json.loads(json.dumps(made_from)):
+        found = {}
+    ours = "made from" in found and exr.is_intact(target)
+    if ours and found["made from"] == json.loads(json.dumps(made_from)):
         return "done"
-    if force or (ours and before.get("frame") == made_from["frame"]):
+    if force or (ours and found.get("path") == path_from(target, frame)):
         return "to do"
     why = "jscomb combine did not make it, or it was changed since"
     if ours:
-        why = f"jscomb combine made it of {before.get('frame')}"
+        why = f"jscomb combine made it of {found.get('path')}"
     raise ValueError(f"{target} exists, and {why}: --force replaces it")
+
+
+def path_from(target: str, frame: str) -> str:
+    """Return the path of a frame as seen from its result.
+
+    Args:
+        target: the result.
+        frame: file or directory.
+    """
+    return os.path.relpath(frame, os.path.dirname(os.path.abspath(target)))

@@ -16,7 +16,7 @@ complete one.
 
 from jscomb.exr._beside import Feature, align, convert, read_feature
 from jscomb.exr._contents import Channels, Contents, open_source, read_contents
-from jscomb.exr._files import MAX_BYTES, discard_unfinished
+from jscomb.exr._files import MAX_BYTES
 from jscomb.exr._read import bundled, read_frame, read_image, read_provenance
 from jscomb.exr._results import is_intact, write_contents
 from jscomb.exr._write import write_frame, write_image
@@ -29,7 +29,6 @@ __all__ = [
     "align",
     "bundled",
     "convert",
-    "discard_unfinished",
     "is_intact",
     "open_source",
     "read_contents",
