@@ -138,7 +138,8 @@ def test_command_exists(words, monkeypatch):
 )
 def test_command_runs(words, jscomb, reader):
     frame = exr.read_frame(reader / "frame.exr")
-    exr.write_image(reader / "out.exr", frame.color)
+    if words[1] == "compare":
+        exr.write_image(reader / "out.exr", frame.color)
     status, out, error = jscomb(*words[1:])
     assert (status, error) == (0, "")
     assert out

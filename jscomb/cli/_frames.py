@@ -314,8 +314,9 @@ def _with_biased(
 
 def _biased_image(biased: str, other: Contents) -> Image:
     """The denoised image of a file; raise where only noise is known."""
-    if other.frame is None or other.is_denoised:
+    if other.denoised is not None or other.dialect == "result":
         return other.image
+    assert other.frame is not None
     held = other.frame.estimates
     if len(held) > 1:
         raise ValueError(f"{biased}: holds several biased images: {', '.join(held)}")

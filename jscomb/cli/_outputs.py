@@ -102,11 +102,8 @@ def state(
         raise ValueError(f"{target}: is a folder")
     if not os.path.isfile(target):
         raise ValueError(f"{target}: is not a file")
-    try:
-        found = exr.read_provenance(target)
-    except (ValueError, OSError):
-        found = {}
-    ours = "made from" in found and exr.is_intact(target)
+    found = exr.read_result(target)
+    ours = "made from" in found
     if ours and found["made from"] == json.loads(json.dumps(made_from)):
         return "done"
     if force or (ours and found.get("path") == path_from(target, frame)):

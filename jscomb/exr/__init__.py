@@ -18,7 +18,7 @@ from jscomb.exr._beside import Feature, align, convert, read_feature
 from jscomb.exr._contents import Channels, Contents, open_source, read_contents
 from jscomb.exr._files import MAX_BYTES
 from jscomb.exr._read import bundled, read_frame, read_image, read_provenance
-from jscomb.exr._results import is_intact, write_contents
+from jscomb.exr._results import read_result, write_contents
 from jscomb.exr._write import write_frame, write_image
 
 __all__ = [
@@ -29,13 +29,13 @@ __all__ = [
     "align",
     "bundled",
     "convert",
-    "is_intact",
     "open_source",
     "read_contents",
     "read_feature",
     "read_frame",
     "read_image",
     "read_provenance",
+    "read_result",
     "write_contents",
     "write_frame",
     "write_image",

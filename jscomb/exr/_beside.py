@@ -130,7 +130,7 @@ def align(feature: Feature, target: Contents) -> tuple[Image, list[str]]:
         []
     """
     path, image, at, display = feature
-    notes, size = [], target.image.shape[:2]
+    notes, size = [], target.size
     if at != target.window:
         if display == target.display:
             image = placed(np.asarray(image), at, target.window)
@@ -141,7 +141,7 @@ def align(feature: Feature, target: Contents) -> tuple[Image, list[str]]:
             ]
         if image.shape[:2] != size or np.isnan(image).all():
             raise ValueError(
-                f"{path} is {feature.image.shape}, {target.path} {target.image.shape}"
+                f"{path} is {feature.image.shape}, {target.path} {(*size, 3)}"
             )
     return jnp.asarray(image), notes
 

@@ -33,6 +33,7 @@ class Choice(NamedTuple):
         color: the noisy image; None where there is only a denoised one.
         denoised: the same, denoised.
         features: by name of a buffer.
+        alpha: the layer with the alpha of the colour.
         variance: of the colour.
         unit: of the variance, as in `VARIANCES`.
         notes: what a user must know: one image chosen among several.
@@ -42,6 +43,7 @@ class Choice(NamedTuple):
     color: Layer | None
     denoised: Layer | None
     features: dict[str, Layer]
+    alpha: Layer | None
     variance: Layer | None
     unit: str
     notes: list[str]
@@ -82,6 +84,7 @@ def choose(layers: Sequence[Layer], wanted: Wanted = Wanted()) -> Choice:  # noq
         color,
         denoised[0] if denoised else None,
         features,
+        _alpha([main, *denoised, *near]),
         variance[0] if variance else None,
         unit,
         _notes(color, denoised, rivals),
@@ -96,6 +99,7 @@ def channels_of(layer: Layer, role: str) -> list[str]:
         "normal": layer.letters("XYZ", "RGB", "UVW"),
         "depth": layer.single,
         "visibility": layer.single,
+        "alpha": layer.letters("A") or layer.single,
         "variance": layer.letters("RGB", "XYZ") or layer.single,
     }.get(role, layer.color)
     if found is None:
@@ -180,6 +184,17 @@ def _feature(
             if layer not in found
         ]
     return found
+
+
+def _alpha(layers: Sequence[Layer]) -> Layer | None:
+    """The layer with the alpha: the colour's own, or one that is called so."""
+    main, *others = layers
+    if "A" in main.channels:
+        return main
+    own = [layer for layer in others if "A" in layer.channels]
+    image = [layer for layer in own if layer.bare or layer.rank("beauty") is not None]
+    called = [layer for layer in others if layer.rank("alpha") is not None]
+    return next(iter([*image, *called]), None)
 
 
 def _variance(

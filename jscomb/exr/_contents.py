@@ -49,12 +49,11 @@ class Contents(NamedTuple):
         file: the file with the colour.
         dialect: a key of `dialects.DIALECTS`.
         frame: of the data window; None where there is only a denoised image.
-        image: the best image: the denoised one if there is one, else the colour,
-            [H,W,3].
-        is_denoised: whether `image` is a denoised or combined one.
+        denoised: what the renderer or a denoiser has denoised, [H,W,3]; None if there
+            is none.
         window: the data window of the colour: left, top, width, height.
         display: the display window.
-        alpha: [H,W] if the colour has one.
+        alpha: [H,W], NaN where it is unknown; None if there is none.
         chromaticities: of its primaries and white; None if not stated.
         layers: all channels.
         notes: lines for the user.
@@ -70,8 +69,7 @@ class Contents(NamedTuple):
     file: str
     dialect: str
     frame: Frame | None
-    image: Image
-    is_denoised: bool
+    denoised: Image | None
     window: Window
     display: Window
     alpha: np.ndarray | None
@@ -86,6 +84,19 @@ class Contents(NamedTuple):
     missing: str = ""
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the data window."""
+        return self.window[3], self.window[2]
+
+    @property
+    def image(self) -> Image:
+        """The denoised image if there is one beside the noise, else the colour."""
+        if self.denoised is not None and self.dialect != "result":
+            return self.denoised
+        assert self.frame is not None
+        return self.frame.color
+
+    @property
     def median_luminance(self) -> float:
         """The median of the positive luminances, by the file's own primaries."""
         weights = _color.luminance_weights(self.chromaticities)
@@ -98,7 +109,7 @@ class Contents(NamedTuple):
     def empty(self) -> np.ndarray:
         """Where a transparent film shows nothing: no alpha and no radiance, [H,W,1]."""
         if self.alpha is None or self.frame is None:
-            return np.zeros((*self.image.shape[:2], 1), bool)
+            return np.zeros((*self.size, 1), bool)
         black = np.all(np.asarray(self.frame.color) == 0, axis=-1)
         return ((self.alpha == 0) & black)[..., None]
 
@@ -225,19 +236,14 @@ def _contents(source: Source, dialect: str, read: Reading) -> Contents:
     part = read.parts[read.color.part if read.color else 0]
     at = data_window(part)
     denoised = read.arguments.get("estimates", {}).get("denoised")
-    is_denoised = dialect == "result" or denoised is not None
-    if denoised is None or dialect == "result":
-        assert frame is not None
-        image = frame.color
-    else:
-        image = getattr(denoised, "image", denoised)
+    if denoised is not None:
+        denoised = jnp.asarray(getattr(denoised, "image", denoised))
     return Contents(
         source.path,
         read.file,
         dialect,
         frame,
-        jnp.asarray(image),
-        is_denoised,
+        denoised,
         at,
         window(part.attributes, "displayWindow"),
         _alpha(read, at),
@@ -255,13 +261,13 @@ def _contents(source: Source, dialect: str, read: Reading) -> Contents:
 
 def _alpha(read: Reading, at: Window) -> np.ndarray | None:
     """The alpha of the colour."""
-    name = read.color.channels.get("A") if read.color else None
-    if read.color is None or name is None:
+    place = read.alpha
+    if place is None and read.color is not None and "A" in read.color.channels:
+        place = read.color.part, read.color.channels["A"]
+    if place is None or place[1] not in read.parts[place[0]].channels:
         return None
-    part = read.parts[read.color.part]
-    if name not in part.channels:
-        return None
-    return placed(part.channels[name].astype(np.float32), data_window(part), at)
+    part = read.parts[place[0]]
+    return placed(part.channels[place[1]].astype(np.float32), data_window(part), at)
 
 
 def _shown(rivals: dict[str, list[Layer]]) -> dict[str, list[str]]:

@@ -39,6 +39,7 @@ FEATURES = {
     ),
     "visibility": ("visibility",),
 }
+ALPHAS = ("alpha", "a", "opacity")
 # Of the mean, of one sample (the unbiased estimate), or the mean squared deviation.
 VARIANCES = {
     "denoisingvariance": "deviation",
@@ -79,6 +80,6 @@ _ROLES: dict[str, tuple[str, ...]] = {
     "noisy": NOISY,
     "denoised": DENOISED,
     **FEATURES,
+    "alpha": ALPHAS,
     "variance": tuple(VARIANCES),
 }
-ROLES = tuple(_ROLES)

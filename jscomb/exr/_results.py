@@ -64,8 +64,8 @@ def write_contents(
         []
     """
     array = np.asarray(image, np.float32)
-    if array.shape != contents.image.shape:
-        raise ValueError(f"image is {array.shape}, the frame {contents.image.shape}")
+    if array.shape != (*contents.size, 3):
+        raise ValueError(f"image is {array.shape}, the frame {(*contents.size, 3)}")
     if contents.color is None:
         parts, lost = _own(contents, array, error, layers, provenance), []
         if layers == "all" and contents.frame is not None:
@@ -77,31 +77,34 @@ def write_contents(
     return lost + ([f"not written: attribute {', '.join(names)}"] if names else [])
 
 
-def is_intact(path: str | os.PathLike) -> bool:
-    """Return whether a combined image is complete and unchanged since it was written.
+def read_result(path: str | os.PathLike) -> dict[str, Any]:
+    """Return the provenance of an image that is complete and as it was written.
 
     Args:
-        path: EXR file.
+        path: EXR file, written by `write_contents`, `write_image` or `write_frame`.
 
     Returns:
-        whether jscomb wrote it and its colour is what was written.
+        its provenance; empty if another program wrote it, or changed it since, or if
+        it cannot be read.
 
     Example:
         >>> from jscomb import exr
-        >>> print(is_intact(exr.bundled()["cornell-glass-64"]))
-        True
+        >>> print(read_result(exr.bundled()["cornell-glass-64"])["spp"])
+        64
     """
     try:
         headers = read_headers(os.fspath(path))
         about = native.result_of(headers.parts)
         if about is None:
             native.from_parts(read_pixels(headers), None, False)
-            return True
-        wanted = {about["part"]: about["channels"]}
-        part = read_pixels(headers, wanted)[about["part"]]
-        return native.checksum(part.channels) == about["crc32"]
+        else:
+            wanted = {about["part"]: about["channels"]}
+            part = read_pixels(headers, wanted)[about["part"]]
+            if native.checksum(part.channels) != about["crc32"]:
+                return {}
+        return native.provenance(headers.parts)
     except (OSError, ValueError, KeyError, IndexError):
-        return False
+        return {}
 
 
 def _own(
@@ -149,8 +152,9 @@ def _like(
     lost += line
     if layers == "color":
         plain = dict(zip("RGB" if len(names) == 3 else "Y", new.values(), strict=True))
-        if alpha := color.channels.get("A"):
-            plain["A"] = source.channels[alpha]
+        if contents.alpha is not None:
+            own = color.channels.get("A")
+            plain["A"] = source.channels[own] if own else contents.alpha
         kept = {k: v for k, v in _attributes(source, lost).items() if not _of_layers(k)}
         return [Part("", plain, kept)], lost
     parts = []

@@ -56,6 +56,7 @@ class Reading(NamedTuple):
         notes: lines for the user.
         choice: how the layers were chosen; None where the dialect needs no choice.
         missing: why a variance that is there was not read; else empty.
+        alpha: the number of its part and its channel; None if there is none.
     """
 
     arguments: Arguments
@@ -66,6 +67,7 @@ class Reading(NamedTuple):
     notes: list[str]
     choice: Choice | None = None
     missing: str = ""
+    alpha: tuple[int, str] | None = None
 
 
 class Source:
@@ -188,8 +190,8 @@ def estimate(image: np.ndarray, halves: np.ndarray | None) -> Estimate:
 
 
 def clipped(albedo: np.ndarray | None) -> np.ndarray | None:
-    """Return an optional albedo, clipped to [0, 1]."""
-    return None if albedo is None else np.clip(albedo, 0, 1)
+    """Return an optional albedo, clipped to [0, 1] in place."""
+    return None if albedo is None else np.clip(albedo, 0, 1, out=albedo)
 
 
 def finite_depth(depth: np.ndarray) -> np.ndarray:

@@ -39,8 +39,10 @@ def layered(
         wanted.setdefault(layer.part, set()).update(channels_of(layer, role))
     main = choice.color or choice.denoised
     assert main is not None
-    if alpha := main.channels.get("A"):
-        wanted[main.part].add(alpha)
+    alpha = None
+    if choice.alpha is not None:
+        alpha = choice.alpha.part, channels_of(choice.alpha, "alpha")[0]
+        wanted.setdefault(alpha[0], set()).add(alpha[1])
     parts = read_pixels(
         headers, None if options.everything else wanted, max_bytes=options.max_bytes
     )
@@ -62,6 +64,7 @@ def layered(
         [*_skipped(headers), *choice.notes],
         choice,
         missing,
+        alpha,
     )
 
 
@@ -85,9 +88,11 @@ def _image(parts: list[Part], layer: Layer, role: str, main: Layer) -> np.ndarra
     """A layer as float32 [H,W,C] on the window of the colour."""
     part = parts[layer.part]
     names = channels_of(layer, role)
-    image = np.stack([part.channels[n].astype(np.float32) for n in names], axis=-1)
     if len(names) == 1 and role in ("color", "denoised", "variance"):
-        image = np.repeat(image, 3, axis=-1)
+        names *= 3
+    image = np.empty((*part.channels[names[0]].shape, len(names)), np.float32)
+    for number, name in enumerate(names):
+        image[..., number] = part.channels[name]
     return placed(image, data_window(part), data_window(parts[main.part]))
 
 
