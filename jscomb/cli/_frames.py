@@ -158,6 +158,8 @@ def _with_feature(
     common: dict[str, Any],
 ) -> Frame:
     """The frame with a feature or the variance from another file."""
+    if common["samples"] is None and frame.samples is not None:
+        common = common | {"samples": float(frame.samples)}
     image, said = exr.align(exr.read_feature(source, name, **common), contents)
     notes += said
     if name == "variance":

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jscomb.exr import _color
-from jscomb.exr._choice import Choice, channels_of, choose
+from jscomb.exr._choice import channels_of, unit_of
 from jscomb.exr._contents import Contents, open_source
 from jscomb.exr._files import MAX_BYTES, read_pixels, window
 from jscomb.exr._layers import Layer, layers_of
@@ -40,7 +40,7 @@ def read_feature(
     path: str | os.PathLike | Source,
     name: str,
     *,
-    samples: int | None = None,
+    samples: int | float | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Feature:
     """Read one feature, or the variance, from a file of its own.
@@ -69,14 +69,14 @@ def read_feature(
     source = path if isinstance(path, Source) else open_source(path)
     headers = source.headers(source.path)
     layers = layers_of(headers)
-    try:
-        layer, unit = _named(choose(layers), name)
-    except ValueError:
-        layer, unit = None, "mean"
-    usable = [each for each in layers if _channels(each, name)]
-    layer = layer or next(iter(sorted(usable, key=lambda each: not each.bare)), None)
-    if layer is None:
+    usable = [layer for layer in layers if _channels(layer, name)]
+    called = [layer for layer in usable if layer.rank(name) is not None]
+    if not usable:
         raise ValueError(f"{source.path}: has no {name}")
+    layer = min(
+        called or usable, key=lambda each: (each.rank(name) or 0, not each.bare)
+    )
+    unit = unit_of(layer) if called else "mean"
     names = channels_of(layer, name)
     part = read_pixels(headers, {layer.part: set(names)}, max_bytes=max_bytes)
     planes = part[layer.part].channels
@@ -86,19 +86,15 @@ def read_feature(
         if unit != "mean":
             unbiased = unit == "sample"
             stored = f"the variance ({source.path})"
-            image = variance_of_mean(image, samples, stored, unbiased=unbiased)
+            try:
+                image = variance_of_mean(image, samples, stored, unbiased=unbiased)
+            except ValueError as error:
+                raise ValueError(f"{source.path}: {error}") from None
     if name == "albedo":
         image = np.clip(image, 0, 1)
     attributes = part[layer.part].attributes
     windows = (window(attributes, f"{kind}Window") for kind in ("data", "display"))
     return Feature(source.path, image, *windows)
-
-
-def _named(choice: Choice, name: str) -> tuple[Layer | None, str]:
-    """The layer that is called so, and what a variance is of."""
-    if name == "variance":
-        return choice.variance, choice.unit if choice.variance else "mean"
-    return choice.features.get(name), ""
 
 
 def _channels(layer: Layer, name: str) -> list[str] | None:

@@ -209,10 +209,13 @@ def _variance(
     else:
         name, unit = "", ""
         found = _ranked(near, "variance", lambda layer: layer.single)
-    if found and not unit:
-        last = plain(found[0].name.rpartition(".")[2])
-        unit = VARIANCES.get(plain(found[0].name), VARIANCES.get(last, "mean"))
-    return found, unit
+    return found, unit or (unit_of(found[0]) if found else "")
+
+
+def unit_of(layer: Layer) -> str:
+    """Return what a variance is of, as its name tells."""
+    last = plain(layer.name.rpartition(".")[2])
+    return VARIANCES.get(plain(layer.name), VARIANCES.get(last, "mean"))
 
 
 def _named(layers: Sequence[Layer], role: str, name: str) -> list[Layer]:

@@ -13,7 +13,6 @@ import numpy as np
 
 _MULTI_PART = 0x1000
 _MAX_NAME = 255  # bytes
-_MAX_BYTES = 2**28  # of one attribute
 _TYPES = {0: np.uint32, 1: np.float16, 2: np.float32}
 
 
@@ -46,6 +45,8 @@ def _read(file: BinaryIO) -> Raw:
     """The headers; raises if they are malformed."""
     data = bytearray(file.read(8))
     _, version = struct.unpack("<ii", data)
+    end = file.seek(0, io.SEEK_END)
+    file.seek(len(data))
     types, escaped, renamed = [], [], False
     while True:
         channels, texts = {}, {}
@@ -53,11 +54,9 @@ def _read(file: BinaryIO) -> Raw:
             kind = _name(file)
             size = file.read(4)
             (count,) = struct.unpack("<i", size)
-            if not 0 <= count <= _MAX_BYTES:
-                raise ValueError("impossible size of an attribute")
+            if not 0 <= count <= end - file.tell():
+                raise ValueError("an attribute is longer than the file")
             value = file.read(count)
-            if len(value) < count:
-                raise EOFError
             safe_name, safe = _ascii(name), value
             if kind == b"string" and not _is_text(value):
                 texts[safe_name.decode()] = value.decode("utf-8", "backslashreplace")

@@ -239,7 +239,6 @@ def _ours(attributes: dict[str, Any]) -> dict[str, Any]:
 
 def _unusual(color: np.ndarray) -> Iterator[Case]:
     """Yield valid files of kinds that few programs write."""
-    height, width = SIZE
     types = {"R": np.float16, "G": np.float32, "B": np.uint32}
     whole = np.round(100 * color)
     mixed = {n: whole[..., c].astype(t) for c, (n, t) in enumerate(types.items())}
