@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
 from jscomb.exr import _color
 from jscomb.exr._choice import channels_of, unit_of
@@ -143,7 +144,7 @@ def align(feature: Feature, target: Contents) -> tuple[Image, list[str]]:
 
 
 def convert(
-    image: Image, contents: Contents, target: Contents
+    image: ArrayLike, contents: Contents, target: Contents
 ) -> tuple[Image, list[str]]:
     """Return an image of one file in the primaries and on the window of another.
 

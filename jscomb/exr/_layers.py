@@ -138,8 +138,9 @@ def _view(prefix: str, views: list[str], own: str) -> tuple[str, str]:
 
 
 def _without(name: str, view: str) -> str:
-    """A part's name without the view that it is of."""
-    return ".".join(c for c in name.split(".") if not view or c != view)
+    """A part's name without the view that it is of: rgba_right, left.depth."""
+    own = rf"(?:^|[._\- ]){re.escape(view)}(?=$|[._\- ])"
+    return re.sub(own, "", name).lstrip("._- ") if view else name
 
 
 def _sided(layers: list[Layer]) -> list[Layer]:

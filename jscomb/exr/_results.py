@@ -18,6 +18,7 @@ from jscomb.frame import Frame, make_frame
 Layers = Literal["all", "color"]
 Pixels = Literal["same", "half", "float"]
 ERROR = "error.Y"
+_LOSSY = ("B44", "B44A", "DWAA", "DWAB", "PXR24")
 _HALF_MAX = float(np.finfo(np.float16).max)
 _OF_THE_FILE = ("channels", "name", "chunkCount", "version")  # written by the binding
 
@@ -100,7 +101,7 @@ def read_result(path: str | os.PathLike) -> dict[str, Any]:
         else:
             wanted = {about["part"]: about["channels"]}
             part = read_pixels(headers, wanted)[about["part"]]
-            if native.checksum(part.channels) != about["crc32"]:
+            if about["crc32"] not in (None, native.checksum(part.channels)):
                 return {}
         return native.provenance(headers.parts)
     except (OSError, ValueError, KeyError, IndexError):
@@ -157,6 +158,8 @@ def _like(
             plain["A"] = source.channels[own] if own else contents.alpha
         kept = {k: v for k, v in _attributes(source, lost).items() if not _of_layers(k)}
         return [Part("", plain, kept)], lost
+    if codec := _lossy(source):
+        lost.append(f"compressed with loss, as {contents.file} is: {codec}")
     parts = []
     for number, part in enumerate(contents.parts):
         reason = contents.unusable.get(number, "")
@@ -187,6 +190,13 @@ def _typed(
         types = dict.fromkeys(names, np.dtype(np.float32))
         line = ["written in 32 bits: the colour does not fit into 16"]
     return {n: planes[..., c].astype(types[n]) for c, n in enumerate(names)}, line
+
+
+def _lossy(part: Part) -> str:
+    """The name of a compression that changes pixels; empty if it does not."""
+    name = part.attributes.get("compression", OpenEXR.NO_COMPRESSION).name
+    name = name.removesuffix("_COMPRESSION")
+    return name if name in _LOSSY else ""
 
 
 def _of_layers(attribute: str) -> bool:
@@ -224,6 +234,8 @@ def _about(
         "channels": names,
         "crc32": native.checksum({name: written[name] for name in names}),
     }
+    if _lossy(parts[number]):
+        about["crc32"] = None  # of pixels that will be others
     return {
         native.RESULT: json.dumps(about),
         native.PROVENANCE: json.dumps(provenance, default=str),

@@ -212,7 +212,7 @@ def result_of(parts: list[Part]) -> dict[str, Any] | None:
                 "layer": str(found["layer"]),
                 "part": int(found["part"]),
                 "channels": [str(name) for name in found["channels"]],
-                "crc32": int(found["crc32"]),
+                "crc32": found["crc32"],
             }
         except (KeyError, TypeError, ValueError):
             continue
