@@ -51,7 +51,16 @@ class Job(NamedTuple):
     def beside(self) -> list[str]:
         """The files that are read beside the frame's."""
         given = [self.biased, *self.halves, *self.features.values()]
-        return [file for file in given if file is not None and os.path.exists(file)]
+        return [file for file in given if file is not None and is_path(file)]
+
+
+def is_path(given: str) -> bool:
+    """Return whether a file is meant, not a denoiser or a layer.
+
+    Args:
+        given: to an option that takes both.
+    """
+    return given not in methods.METHODS and os.path.exists(given)
 
 
 class Sources:
@@ -81,7 +90,7 @@ class Sources:
         """What distinguishes one combination from another: contents, not dates."""
         job = self.job
         digests = lambda path: self[path].digests()
-        known = lambda given: digests(given) if os.path.exists(given) else given
+        known = lambda given: digests(given) if is_path(given) else given
         return {
             "jscomb": version,
             "frame": os.path.basename(os.path.abspath(job.frame)),
@@ -112,7 +121,7 @@ class Loaded(NamedTuple):
 def load(sources: Sources, options: Options, max_bytes: int) -> Loaded:
     """Return the frame of a job; raise if its parts do not fit together."""
     job = sources.job
-    layers = {n: g for n, g in job.features.items() if not os.path.exists(g)}
+    layers = {n: g for n, g in job.features.items() if not is_path(g)}
     common: dict[str, Any] = {"samples": options.samples, "max_bytes": max_bytes}
     contents = exr.read_contents(
         sources.frame,

@@ -68,16 +68,19 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
 
 
-def compare(image: FramePath, reference: FramePath, /) -> None:
+def compare(
+    image: FramePath, reference: FramePath, /, *, max_memory: MaxMemory = MAX_MEMORY
+) -> None:
     """Print the errors of an image against a reference.
 
     Args:
         image: EXR file; its denoised image is compared if it has one, else its colour.
         reference: EXR file; the reference in it if it is a frame that has one, else
             its denoised image or its colour.
+        max_memory: mebibytes that the pixels of one file may take in memory.
     """
-    found = exr.read_contents(image, statistics=False)
-    against = exr.read_contents(reference, statistics=False)
+    read = functools.partial(exr.read_contents, max_bytes=max_memory * 2**20)
+    found, against = (read(path, statistics=False) for path in (image, reference))
     for contents in (found, against):
         for note in contents.notes:
             print(f"{contents.path}: {note}")

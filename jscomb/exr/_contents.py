@@ -282,7 +282,8 @@ def _listed(headers: Headers, read: Reading) -> list[Channels]:
     choice = read.choice
     if choice is not None:
         layers = {"color": choice.color, "denoised": choice.denoised}
-        layers |= {**choice.features, "variance": choice.variance}
+        layers |= {**choice.features, "alpha": choice.alpha}
+        layers["variance"] = choice.variance
         for role, layer in layers.items():
             for name in read.taken.get(role, []):
                 assert layer is not None

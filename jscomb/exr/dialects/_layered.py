@@ -60,7 +60,8 @@ def layered(
         path,
         main,
         parts,
-        {role: channels_of(layer, role) for role, layer in roles.items()},
+        {role: channels_of(layer, role) for role, layer in roles.items()}
+        | ({} if alpha is None else {"alpha": [alpha[1]]}),
         [*_skipped(headers), *choice.notes],
         choice,
         missing,
