@@ -24,7 +24,8 @@ def targets(frames: Sequence[str], out: str) -> list[str]:
     if not out:
         raise ValueError("-o: expected a file or a folder, got nothing")
     is_folder = os.path.isdir(out) or out.endswith((os.sep, "/"))
-    is_file = os.path.lexists(out) and not os.path.isdir(out)
+    path = out.rstrip("/") or out
+    is_file = os.path.lexists(path) and not os.path.isdir(path)
     has_suffix = out.lower().endswith(SUFFIX)
     if len(frames) == 1 and not is_folder:
         if not has_suffix:
@@ -34,7 +35,8 @@ def targets(frames: Sequence[str], out: str) -> list[str]:
             )
         return [out]
     if is_file or (has_suffix and not is_folder):
-        raise ValueError(f"-o {out}: {len(frames)} frames need a folder, not a file")
+        count = f"{len(frames)} frames need" if len(frames) > 1 else "this names"
+        raise ValueError(f"-o {out}: {count} a folder, not a file")
     found = [os.path.join(out, name_of(frame) + SUFFIX) for frame in frames]
     if twice := {os.path.basename(f) for f in found if found.count(f) > 1}:
         raise ValueError(f"several frames would be written as {', '.join(twice)}")

@@ -130,7 +130,7 @@ def _axes(like: str) -> str:
 def _view(prefix: str, views: list[str], own: str) -> tuple[str, str]:
     """The stereo view of a channel's prefix, and the rest of it."""
     components = prefix.split(".") if prefix else []
-    for view in views:
+    for view in [*views, *([own] if own else [])]:
         if view in components[-1:] or view in components[:1]:
             components.remove(view)
             return view, ".".join(components)

@@ -14,12 +14,13 @@ import re
 BEAUTIES = (
     *("", "rgba", "rgb", "beauty", "c", "ci", "image", "combined", "color", "colour"),
     *("rgbcolor", "default", "main", "final", "master", "primary", "radiance", "hdr"),
+    *("finalimage", "finalimagergba", "rendered"),
 )
 WITHIN_GROUPS = ("combined", "beauty", "rgba", "rgb", "c", "ci")  # of view layers
 NOISY = ("noisyimage", "noisy", "noisybeauty", "denoisingimage", "rgbanoisy")
 DENOISED = (
     *("denoised", "denoise", "effectsresult", "denoiser", "vraydenoiser", "optix"),
-    *("oidn", "denoisedimage", "filtered", "dn"),
+    *("oidn", "denoisedimage", "filtered", "dn", "denoiseoidn", "denoiseoptix"),
 )
 FEATURES = {
     "albedo": (
@@ -56,7 +57,7 @@ VARIANCES = {
     "colourvariance": "mean",
     "meanvariance": "mean",
 }
-_DENOISED = re.compile(r"(?:denoised?|dn)(.+)|(.+?)(?:denoised?|dn)")
+_DENOISED = re.compile(r"(?:denoised?|dn)(.+)|(.+?)(?:denoised?|dn)(?:oidn|optix)?")
 
 
 def plain(name: str) -> str:
