@@ -15,26 +15,30 @@ Each paper is one package of pure functions: `james_stein`, `ensemble`,
 how to choose among them, on files, on large frames and on research.
 """
 
-from jscomb import (
-    denoisers,
-    double_shrinkage,
-    ensemble,
-    exr,
-    features,
-    frame,
-    guide,
-    james_stein,
-    learning,
-    methods,
-    metrics,
-    numerics,
-    progressive,
-    rendering,
-    uncorrelated,
-)
-from jscomb.exr import read_frame
-from jscomb.frame import Estimate, Frame, make_frame
-from jscomb.methods import combine
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jscomb import (
+        denoisers,
+        double_shrinkage,
+        ensemble,
+        exr,
+        features,
+        frame,
+        guide,
+        james_stein,
+        learning,
+        methods,
+        metrics,
+        numerics,
+        progressive,
+        rendering,
+        uncorrelated,
+    )
+    from jscomb.exr import read_frame
+    from jscomb.frame import Estimate, Frame, make_frame
+    from jscomb.methods import combine
 
 __all__ = [
     "Estimate",
@@ -60,3 +64,25 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
+
+_NAMES = {
+    "Estimate": "jscomb.frame",
+    "Frame": "jscomb.frame",
+    "combine": "jscomb.methods",
+    "make_frame": "jscomb.frame",
+    "read_frame": "jscomb.exr",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a room when it is asked for first: JAX is slow to import."""
+    if name in _NAMES:
+        return getattr(importlib.import_module(_NAMES[name]), name)
+    if name in __all__:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Names that are imported when asked for, too."""
+    return sorted({*globals(), *__all__})

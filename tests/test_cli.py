@@ -424,7 +424,7 @@ BAD = {
         ["--biased", "nlm"],
         "neither a file, nor a denoiser, nor a biased",
     ),
-    "no image": (lambda d: GLASS, ["--biased", os.fspath(DATA)], "has neither"),
+    "itself": (lambda d: GLASS, ["--biased", os.fspath(DATA)], "is the frame itself"),
 }
 
 

@@ -276,15 +276,14 @@ def test_oidn_training_files(tmp_path, reference):
         ((5, 5, 14, 16), (0, 0, 3, 3)),  # nothing in common
     ],
 )
-def test_data_windows_are_placed(tmp_path, data, display):
+def test_a_frame_is_its_data_window(tmp_path, data, display):
+    """All that was rendered, and nothing else; the contents know where it is."""
     x0, y0, x1, y1 = data
     pixels = noise(0, y1 - y0 + 1, x1 - x0 + 1)
     corners = lambda w: (np.int32(w[:2]), np.int32(w[2:]))
     header = {"dataWindow": corners(data), "displayWindow": corners(display)}
     path = write(tmp_path / "c.exr", {"Y": pixels}, **header)
-    image = np.asarray(exr.read_image(path)[..., 0])
-    assert image.shape == (display[3] + 1, display[2] + 1)
-    for row, column in np.ndindex(*image.shape):
-        inside = x0 <= column <= x1 and y0 <= row <= y1
-        expected = pixels[row - y0, column - x0] if inside else np.nan
-        np.testing.assert_array_equal(image[row, column], expected)
+    contents = exr.read_contents(path)
+    np.testing.assert_array_equal(contents.image[..., 0], pixels)
+    assert contents.window == (x0, y0, x1 - x0 + 1, y1 - y0 + 1)
+    assert contents.display == (0, 0, display[2] + 1, display[3] + 1)

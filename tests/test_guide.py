@@ -12,7 +12,8 @@ import jax
 import numpy as np
 import pytest
 
-from jscomb import cli, exr
+from jscomb import exr
+from jscomb.cli._parsing import parse
 from jscomb.frame import Estimate
 from tests.battery.public import slug
 from tests.test_exr import layer, write
@@ -139,7 +140,7 @@ def test_command_exists(words, monkeypatch):
         program, *rest = each.split()
         if program == "jscomb":
             monkeypatch.setattr(sys, "argv", [program, *rest])
-            assert callable(cli._parse())
+            assert callable(parse())
         elif program == "python":
             assert rest[0] == "-m"
             assert (ROOT / f"{rest[1].replace('.', '/')}.py").exists()

@@ -83,6 +83,7 @@ def test_sequences_go_on(jscomb, tmp_path):
 
 
 def test_what_has_changed_is_made_anew(jscomb, tmp_path):
+    """By contents, not by dates; only by --force what is no result of the frame."""
     frame, out = tmp_path / "f.exr", tmp_path / "out"
     out.mkdir()
     frame.write_bytes(GLASS.read_bytes())
@@ -91,9 +92,15 @@ def test_what_has_changed_is_made_anew(jscomb, tmp_path):
     assert "there already" in jscomb(*command, "whitened")[1]
     assert "there already" not in jscomb(*command, "denoised")[1]
     os.utime(frame, ns=(0, 0))
-    assert "there already" not in jscomb(*command, "denoised")[1]
+    assert "there already" in jscomb(*command, "denoised")[1]
+    frame.write_bytes(BOX.read_bytes())
+    assert "wrote" in jscomb(*command, "denoised")[1]
     (out / "f.exr").write_bytes(b"no image")
-    assert "there already" not in jscomb(*command, "denoised")[1]
+    status, _, said = jscomb(*command, "denoised")
+    assert status == 2
+    assert "--force replaces it" in said
+    assert (out / "f.exr").read_bytes() == b"no image"
+    assert "wrote" in jscomb(*command, "denoised", "--force")[1]
 
 
 def test_names_must_differ(jscomb, tmp_path):

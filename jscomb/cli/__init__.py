@@ -1,34 +1,26 @@
 """The command `jscomb`: render, combine, compare, view and describe frames, and train.
 
-Errors of the input are one line on standard error and exit status 2.
+Errors of the input are one line on standard error and exit status 2; Ctrl-C is one line
+and status 130, also while the package is still being imported.
 """
 
-import contextlib
-import functools
-import io
+import importlib
 import os
-import re
 import sys
-from collections.abc import Callable
-from typing import Any
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
 
-import jax
-import tyro
+from jscomb.cli._interrupting import ends_on_interrupt
 
-import jscomb
-from jscomb import cache, methods, rendering
-from jscomb.cli._combining import combine
-from jscomb.cli._rendering import render, render_file
-from jscomb.cli._showing import demo, info
-from jscomb.cli._training import (
-    Run,
-    prepare,
-    split_files,
-    train,
-    train_files,
-    with_bases,
-)
-from jscomb.cli._viewing import compare, view
+if TYPE_CHECKING:
+    from jscomb.cli._rendering import render_file
+    from jscomb.cli._training import (
+        Run,
+        prepare,
+        split_files,
+        train_files,
+        with_bases,
+    )
 
 __all__ = [
     "Run",
@@ -44,12 +36,14 @@ __all__ = [
 def main() -> None:
     """Run the command; the entry point of `jscomb`."""
     if sys.argv[1:] == ["--version"]:
-        print(f"jscomb {jscomb.__version__}, JAX {jax.__version__}")
+        print(f"jscomb {metadata.version('jscomb')}, JAX {metadata.version('jax')}")
         return
-    _use_compilation_cache()
     try:
-        _parse()()
-        sys.stdout.flush()
+        with ends_on_interrupt():
+            _use_compilation_cache()
+            parsing = importlib.import_module("jscomb.cli._parsing")
+            parsing.parse()()
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
@@ -57,43 +51,20 @@ def main() -> None:
         sys.exit(2)
 
 
-def _parse() -> Callable[[], None]:
-    """Parse the command line into a call to make; a wrong one is a `ValueError`."""
-
-    def later(command: Callable) -> Callable:
-        @functools.wraps(command)
-        def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
-            return lambda: command(*args, **kwargs)
-
-        doc = (command.__doc__ or "").replace("{methods}", listed(methods.METHODS))
-        doc = doc.replace("{tiers}", listed(methods.TIERS))
-        bind.__doc__ = doc.replace("{scenes}", ", ".join(rendering.SCENES))
-        return bind
-
-    listed = lambda table: "; ".join(f"{n} ({m.summary})" for n, m in table.items())
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            return tyro.extras.subcommand_cli_from_dict(
-                {
-                    c.__name__: later(c)
-                    for c in (demo, render, combine, compare, view, info, train)
-                },
-                prog="jscomb",
-                description="Combine unbiased and biased Monte Carlo renderings. "
-                "--version prints the version.",
-            )
-    except SystemExit as end:
-        if not end.code:
-            raise  # --help
-        text = re.sub(r"\x1b\[[0-9;]*m|[^\x00-\x7f]", " ", said.getvalue())
-        text = " ".join(text.replace("-" * 8, "").split())
-        # The heading of its message is the message's first words, too.
-        raise ValueError(re.sub(r"^(\w+ \w+) (?=\1)", "", text)) from None
+def __getattr__(name: str) -> Any:
+    """Import what is asked for first; slow to import, and Ctrl-C must be seen."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    room = "_rendering" if name == "render_file" else "_training"
+    return getattr(importlib.import_module(f"{__name__}.{room}"), name)
 
 
 def _use_compilation_cache() -> None:
     """Keep compiled programs in the user's cache, so the second run starts fast."""
+    import jax
+
+    from jscomb import cache
+
     if jax.__version_info__ < (0, 10, 2):
         return  # it would warn about every program that it finds there
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

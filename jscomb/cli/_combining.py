@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,144 +15,248 @@ from tqdm import tqdm
 import jscomb
 from jscomb import exr, methods, metrics
 from jscomb.cli import _tables as tables
-from jscomb.frame import Estimate, Frame
+from jscomb.cli._frames import FEATURES, Job, Loaded, Options, Sources, load
+from jscomb.cli._matching import expand, is_several, match
+from jscomb.cli._outputs import (
+    check_folder,
+    check_inputs_stay,
+    path_from,
+    state,
+    targets,
+)
+from jscomb.frame import Frame
 from jscomb.numerics.tiles import Local, stream_crops, tile_within
 from jscomb.typing import Image
 
 FramePath = tyro.conf.Positional[Path]
 SampleCount = Annotated[int | None, tyro.conf.arg(metavar="N")]
-_Frames = tyro.conf.Positional[tuple[Path, ...]]
-_Biased = Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")]
+LayerName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+MaxMemory = Annotated[int, tyro.conf.arg(metavar="MIB")]
+_Frames = tyro.conf.Positional[tuple[str, ...]]
+_Biased = Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME|PATTERN")]
+_Halves = Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE|PATTERN")]
+_Feature = Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE|PATTERN")]
 _Method = Annotated[str, tyro.conf.arg(metavar="NAME")]
 _Budget = Annotated[float | None, tyro.conf.arg(metavar="SECONDS")]
 _Memory = Annotated[int, tyro.conf.arg(metavar="MIB")]
+_Force = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 AUTO = "auto"
 LARGE = 2**21  # pixels; larger frames are combined by crops
+MAX_MEMORY = exr.MAX_BYTES // 2**20
 
 
 def combine(
     frames: _Frames,
     /,
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    out: Annotated[str, tyro.conf.arg(aliases=["-o"], metavar="PATH")],
     *,
     biased: _Biased = None,
+    halves: _Halves = (),
     method: _Method = AUTO,
     budget: _Budget = None,
     samples: SampleCount = None,
+    layer: LayerName = None,
+    albedo: _Feature = None,
+    normal: _Feature = None,
+    variance: _Feature = None,
+    layers: Literal["all", "color"] = "all",
+    pixels: Literal["same", "half", "float"] = "same",
     memory: _Memory = 2048,
+    max_memory: MaxMemory = MAX_MEMORY,
+    force: _Force = False,
 ) -> None:
     """Combine path-traced frames with biased images into better images.
 
+    The result has all that the frame's file has, with the combined colour in place of
+    the noisy one and, where it can be estimated, its error as the layer error.Y: other
+    layers, windows, pixel types, compression, attributes. What cannot be written is
+    named.
+
     Several frames are written to a folder, under their names. A result that is there,
-    made of the same files in the same way, is not made again; a frame that cannot be
-    combined is reported at the end, after all others.
+    made of files of the same content in the same way, is not made again; a frame that
+    cannot be combined is reported at the end, after all others. An input is never
+    replaced, and any other file that is not an older result of the frame only by
+    --force.
+
+    Files for a sequence are given as a folder or a pattern (denoised.####.exr), and
+    belong to the frames of the same number.
 
     Tiers of the default method: {tiers}. Methods: {methods}.
 
     Args:
         frames: EXR files of any known renderer, or Tungsten directories.
-        out: EXR file to write; for several frames, or if such a folder exists, the
-            folder.
+        out: EXR file to write; for several frames, or with a slash at its end, or if
+            such a folder exists, the folder.
         biased: EXR file of the biased image, its name within the frame, or a denoiser
-            of the methods. By default a tier makes its own, and adds those of the
-            frame; a method takes the frame's only one, or Open Image Denoise.
+            of the methods; for a sequence a folder or a pattern. By default a tier
+            makes its own, and adds those of the frame; a method takes the frame's only
+            one, or Open Image Denoise.
+        halves: renders of the frame with other seeds and as many samples. An odd number
+            are sub-buffers together with the frame, an even number by themselves. They
+            give what a frame without variance lacks.
         method: a tier, one of the methods, or auto: the best tier within the budget, an
             ensemble whose weights the half buffers tell; for a frame without them the
             tier fast.
         budget: seconds that a tier may take, without compilation; unlimited by default.
         samples: samples a pixel, where the file does not say.
+        layer: the noisy colour in a file of several, a stereo view, or a view layer.
+        albedo: the layer with the albedo, or a file.
+        normal: the layer with the normals, or a file.
+        variance: the layer with the variance of the mean, or a file; NAME:sample if it
+            is that of single samples.
+        layers: all that the file has, or color: R, G, B and alpha alone.
+        pixels: of the combined colour: the same type as the noisy one's, half, or
+            float.
         memory: mebibytes that a method may take beside the images; a large frame is
             combined by crops as large as that allows. A tier takes what it needs.
+        max_memory: mebibytes that the pixels of one file may take in memory.
+        force: replace files that are not results of the frame.
     """
-    options = Options(biased, method, budget, samples, memory)
-    if method not in (known := [AUTO, *methods.TIERS, *methods.METHODS]):
-        known = ", ".join(known)
-        raise ValueError(f"--method {method}: expected one of {known}")
-    if len(frames) == 1 and not out.is_dir():
-        _combine_file(frames[0], out, options)
+    options = Options(method, budget, samples, layer, layers, pixels)
+    limits = Limits(memory * 2**20, max_memory * 2**20, force)
+    _check(options, limits)
+    if not frames and halves:  # each entry is a half; the first is written like
+        frames = tuple(expand(halves[0])) if is_several(halves[0]) else halves[:1]
+    if not frames:
+        raise ValueError("no frame is given: jscomb combine FRAME.exr -o OUT.exr")
+    given = {"albedo": albedo, "normal": normal, "variance": variance}
+    jobs = _jobs(frames, out, biased, halves, given)
+    inputs = [file for job in jobs for file in [job.frame, *job.beside]]
+    check_inputs_stay([job.target for job in jobs], inputs)
+    for job in jobs:
+        if not job.folder:
+            check_folder(job.target)
+    if len(jobs) == 1:
+        _combine_job(jobs[0], options, limits)
     else:
-        _combine_sequence(frames, out, options)
+        _combine_sequence(jobs, options, limits)
 
 
-class Options(NamedTuple):
-    """The options of `combine`."""
+class Limits(NamedTuple):
+    """What changes no result: memory for crops and for files, in bytes; force."""
 
-    biased: str | None
-    method: str
-    budget: float | None
-    samples: int | None
     memory: int
+    max_bytes: int
+    force: bool
 
 
-def _combine_sequence(frames: Sequence[Path], folder: Path, options: Options) -> None:
+def _check(options: Options, limits: Limits) -> None:
+    """Raise unless the options make sense, before any file is touched."""
+    known = [AUTO, *methods.TIERS, *methods.METHODS]
+    if options.method not in known:
+        raise ValueError(
+            f"--method {options.method}: expected one of {', '.join(known)}"
+        )
+    if options.budget is not None and not options.budget >= 0:
+        raise ValueError(f"--budget {options.budget}: expected seconds, at least 0")
+    if limits.memory < 0 or limits.max_bytes < 1:
+        raise ValueError("--memory, --max-memory: expected mebibytes")
+
+
+def _jobs(
+    frames: Sequence[str],
+    out: str,
+    biased: str | None,
+    halves: Sequence[str],
+    features: dict[str, str | None],
+) -> list[Job]:
+    """What to do for each frame."""
+    columns = [_matched("--biased", biased, frames)]
+    columns += [_matched("--halves", half, frames) for half in halves]
+    columns += [_matched(f"--{name}", features[name], frames) for name in FEATURES]
+    jobs = []
+    for number, (frame, target) in enumerate(
+        zip(frames, targets(frames, out), strict=True)
+    ):
+        found = [column[number] for column in columns]
+        wrong = next((each for each in found if isinstance(each, ValueError)), None)
+        first, *others = [None if isinstance(f, ValueError) else f for f in found]
+        files = tuple(half for half in others[: len(halves)] if half is not None)
+        for half in files:
+            if not os.path.exists(half):
+                wrong = ValueError(f"--halves {half}: no such file")
+        own = zip(FEATURES, others[len(halves) :], strict=True)
+        named = {name: each for name, each in own if each is not None}
+        folder = os.path.dirname(target) if target != out else ""
+        jobs.append(Job(frame, target, folder, first, files, named, wrong))
+    return jobs
+
+
+def _matched(
+    option: str, given: str | None, frames: Sequence[str]
+) -> Sequence[str | ValueError | None]:
+    """What is given to each frame."""
+    if given is None or (option == "--biased" and given in methods.METHODS):
+        return [given] * len(frames)
+    return match(option, given, frames)
+
+
+def _combine_sequence(jobs: Sequence[Job], options: Options, limits: Limits) -> None:
     """Combine every frame into the folder, and report those that fail."""
-    targets = [folder / f"{path.stem}.exr" for path in frames]
-    if twice := {t.name for t in targets if targets.count(t) > 1}:
-        raise ValueError(f"several frames would be written as {', '.join(twice)}")
-    folder.mkdir(parents=True, exist_ok=True)
     failed = []
-    pairs = list(zip(frames, targets, strict=True))
-    for path, target in tqdm(pairs, unit="frame", disable=None):
+    for job in tqdm(jobs, unit="frame", disable=None):
         try:
-            if _is_done(path, target, options):
-                print(f"{target} is there already")
-            else:
-                _combine_file(path, target, options)
+            _combine_job(job, options, limits)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
-            print(f"{path}: {error}", file=sys.stderr)
-            failed.append(path.name)
+            print(f"{job.frame}: {' '.join(str(error).split())}", file=sys.stderr)
+            failed.append(os.path.basename(os.path.abspath(job.frame)))
     if failed:
         raise ValueError(
-            f"{len(failed)} of {len(frames)} frames failed: {', '.join(failed)}"
+            f"{len(failed)} of {len(jobs)} frames failed: {', '.join(failed)}"
         )
 
 
-def _is_done(path: Path, target: Path, options: Options) -> bool:
-    """Whether the target was made of this very file with these options."""
-    if not target.exists():
-        return False
+def _combine_job(job: Job, options: Options, limits: Limits) -> None:
+    """Combine one frame, unless that is done already."""
+    if job.wrong is not None:
+        raise job.wrong
+    sources = Sources(job)
+    made_from = sources.made_from(options, jscomb.__version__)
+    check_inputs_stay([job.target], sources.files())
+    if state(job.target, job.frame, made_from, force=limits.force) == "done":
+        print(f"{job.target} is there already")
+        return
+    loaded = load(sources, options, limits.max_bytes)
+    for note in loaded.notes:
+        print(f"{job.frame}: {note}")
     try:
-        provenance = exr.read_provenance(target)
-    except (ValueError, OSError):
-        return False  # another program's, or damaged
-    return provenance.get("made from") == _made_from(path, options)
-
-
-def _made_from(path: Path, options: Options) -> dict[str, Any]:
-    """What distinguishes one combination from another."""
-    biased = options.biased or ""
-    files = [path, *([biased] if os.path.exists(biased) else [])]
-    changed = [os.stat(file).st_mtime_ns for file in files]
-    return {"frame": path.name, "changed": changed, **options._asdict()}
-
-
-def _combine_file(path: Path, out: Path, options: Options) -> None:
-    """Combine one frame."""
-    loaded = exr.read_frame(path, samples=options.samples)
-    made_from = _made_from(path, options)
-    try:
-        frame, name = _with_biased(path, loaded, options.biased)
-        made = _combined(frame, name, options)
+        made = _combined(loaded.frame, loaded.biased, options, limits.memory)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    provenance = {
-        "jscomb": jscomb.__version__,
-        "method": made.method,
-        "frame": path.name,
-        "biased": made.bases,
-        "made from": made_from,
-        "input": exr.read_provenance(path) if path.is_file() else {},
-    }
-    error = None if made.error is None else made.error.map
-    if made.error is not None:
-        provenance["estimated relative L2"] = [float(i) for i in made.error[1:]]
-    exr.write_image(out, made.image, error=error, provenance=provenance)
+        raise ValueError(f"{job.frame}: {error}{_remedy(loaded.frame)}") from None
+    if made.method != options.method and _lacks_noise(loaded.frame):
+        print(f"{job.frame}: neither variance nor half buffers{_remedy(loaded.frame)}")
+    if job.folder:
+        os.makedirs(job.folder, exist_ok=True)
+    _write(job, loaded, made, options, made_from)
     of = f" of {', '.join(made.bases)}" if made.bases else ""
-    print(f"wrote {out}: {tables.size(loaded)}, {made.method}{of}")
-    if loaded.reference is not None:
-        held = {name: estimate.image for name, estimate in frame.estimates.items()}
-        images = {"input": loaded.color, **held, made.method: made.image}
-        tables.print_table({"relative L2": tables.errors(images, loaded)})
+    size = tables.size(loaded.frame)
+    color = loaded.contents.color
+    where = f", as {color.shown}" if color and color.name and _keeps(options) else ""
+    print(f"wrote {job.target}: {size}, {made.method}{of}{where}")
+    if loaded.frame.reference is not None:
+        held = {n: estimate.image for n, estimate in loaded.frame.estimates.items()}
+        images = {"input": loaded.frame.color, **held, made.method: made.image}
+        tables.print_table({"relative L2": tables.errors(images, loaded.frame)})
+
+
+def _keeps(options: Options) -> bool:
+    """Whether the layers of the frame's file are written again."""
+    return options.layers == "all"
+
+
+def _lacks_noise(frame: Frame) -> bool:
+    """Whether nothing tells how noisy a frame is."""
+    return frame.buffers.variance is None and frame.sub_buffers < 2
+
+
+def _remedy(frame: Frame) -> str:
+    """What would make more possible; empty if nothing is missing."""
+    if not _lacks_noise(frame):
+        return ""
+    return (
+        "; a second render with another seed (--halves) or a variance (--variance) "
+        "lets it be combined better"
+    )
 
 
 class Made(NamedTuple):
@@ -164,7 +268,41 @@ class Made(NamedTuple):
     error: metrics.ErrorEstimate | None = None
 
 
-def _combined(frame: Frame, name: str | None, options: Options) -> Made:
+def _write(
+    job: Job, loaded: Loaded, made: Made, options: Options, made_from: dict[str, Any]
+) -> None:
+    """Write the result as the frame's file has it, and say what is lost."""
+    contents, frame = loaded.contents, loaded.frame
+    provenance = {
+        "jscomb": jscomb.__version__,
+        "method": made.method,
+        "frame": os.path.basename(os.path.abspath(job.frame)),
+        "path": path_from(job.target, job.frame),
+        "biased": made.bases,
+        "made from": made_from,
+        "input": contents.provenance,
+    }
+    error = None if made.error is None else np.asarray(made.error.map)
+    if made.error is not None:
+        provenance["estimated relative L2"] = [float(i) for i in made.error[1:]]
+    image, color = np.asarray(made.image), np.asarray(frame.color)
+    image = np.where(np.isfinite(image), image, color)  # unknown: it stays as it is
+    image = np.where(contents.empty, 0, image)
+    error = None if error is None else np.where(contents.empty, 0, error)
+    lost = exr.write_contents(
+        job.target,
+        contents,
+        image,
+        error=error,
+        layers=options.layers,
+        pixels=options.pixels,
+        provenance=provenance,
+    )
+    for line in lost:
+        print(f"{job.target}: {line}")
+
+
+def _combined(frame: Frame, name: str | None, options: Options, memory: int) -> Made:
     """Combine a frame by a tier or a method."""
     key, method = jax.random.key(0), options.method
     if method == AUTO or method in methods.TIERS:
@@ -172,7 +310,7 @@ def _combined(frame: Frame, name: str | None, options: Options) -> Made:
     if methods.METHODS[method].takes == "nothing":
         name = None
     local = methods.plan(key, frame, method=method, biased=name)
-    image = _evaluated(local, options.memory * 2**20)
+    image = _evaluated(local, memory)
     return Made(method, image, _made_of(frame, name, method))
 
 
@@ -220,22 +358,3 @@ def _evaluated(local: Local, memory: int) -> Image:
     for where, part in tqdm(parts, total=count, unit="crop", disable=None):
         image[where] = part
     return jnp.asarray(image)
-
-
-def _with_biased(
-    path: Path, frame: Frame, biased: str | None
-) -> tuple[Frame, str | None]:
-    """The frame with the biased image, and its name; None for any."""
-    if biased is None or biased in frame.estimates or biased in methods.METHODS:
-        return frame, biased
-    held = ", ".join(frame.estimates) or "none"
-    if not os.path.exists(biased):
-        raise ValueError(
-            f"--biased {biased}: neither a file, nor a denoiser, nor a biased image in "
-            f"{path} (it holds {held})"
-        )
-    image = exr.read_image(biased)
-    if image.shape != frame.color.shape:
-        raise ValueError(f"{biased} is {image.shape}, {path} {frame.color.shape}")
-    name = Path(biased).name
-    return frame.with_estimate(name, Estimate(image)), name

@@ -1,7 +1,6 @@
 """`jscomb demo` and `info`."""
 
 import functools
-import os
 import statistics
 import time
 from collections.abc import Callable
@@ -13,9 +12,15 @@ import numpy as np
 
 from jscomb import exr, methods
 from jscomb.cli import _tables as tables
-from jscomb.cli._combining import FramePath, SampleCount, by_tier
+from jscomb.cli._combining import (
+    MAX_MEMORY,
+    FramePath,
+    LayerName,
+    MaxMemory,
+    SampleCount,
+    by_tier,
+)
 from jscomb.denoisers import oidn
-from jscomb.exr import dialects
 from jscomb.frame import Frame
 from jscomb.typing import Image
 
@@ -62,43 +67,104 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
 
 
-def info(frame: FramePath, /, *, samples: SampleCount = None) -> None:
-    """Describe a frame: dialect, buffers, sizes, samples, invalid pixels.
+def info(
+    frame: FramePath,
+    /,
+    *,
+    samples: SampleCount = None,
+    layer: LayerName = None,
+    albedo: LayerName = None,
+    normal: LayerName = None,
+    variance: LayerName = None,
+    max_memory: MaxMemory = MAX_MEMORY,
+) -> None:
+    """Describe a frame: dialect, channels, buffers, sizes, samples, invalid pixels.
 
     Args:
         frame: EXR file of any known renderer, or a Tungsten directory.
         samples: samples a pixel, where the file does not say.
+        layer: the noisy colour in a file of several, a stereo view, or a view layer.
+        albedo: the layer with the albedo.
+        normal: the layer with the normals.
+        variance: the layer with the variance.
+        max_memory: mebibytes that the pixels of the file may take in memory.
     """
-    path, missing = frame, None
-    try:
-        loaded = exr.read_frame(path, samples=samples)
-    except ValueError as error:
-        loaded, missing = exr.read_frame(path, statistics=False), error
-    invalid = int((~loaded.valid).sum())
-    print(f"{path}: {dialects.recognise(os.fspath(path))}")
-    if missing:
-        print(f"  no variance     {missing}")
-    print(f"  size            {tables.size(loaded)}")
-    count = loaded.sub_buffers
-    spp = tables.samples(loaded)
-    print(f"  samples         {spp} a pixel in {count} sub-buffer(s)")
-    print(f"  invalid pixels  {invalid}")
-    print(f"  median luminance {float(loaded.median_luminance):.4g}")
-    stored: dict[str, Any] = {
-        n: b for n, b in loaded.buffers._asdict().items() if b is not None
-    }
-    stored |= {f"biased {name}": e.image for name, e in loaded.estimates.items()}
-    if loaded.reference is not None:
-        stored["reference"] = loaded.reference.image
-    for name, buffer in stored.items():
-        good = np.asarray(buffer)[np.isfinite(buffer)]
-        low, mean, high = (
-            (good.min(), good.mean(), good.max()) if good.size else (np.nan,) * 3
-        )
-        print(f"  {name:<15} {low:10.4g} .. {high:<10.4g} mean {mean:.4g}")
-    if path.is_file():
-        for name, value in exr.read_provenance(path).items():
+    contents = exr.read_contents(
+        frame,
+        samples=samples,
+        layer=layer,
+        albedo=albedo,
+        normal=normal,
+        variance=variance,
+        max_bytes=max_memory * 2**20,
+    )
+    print(f"{contents.path}: {contents.dialect}")
+    _print_file(contents)
+    if contents.missing:
+        print(f"  no variance     {contents.missing}")
+    if contents.frame is not None:
+        _print_frame(contents.frame, contents.median_luminance)
+    else:
+        _print_range("denoised alone", contents.image)
+    for name, value in contents.provenance.items():
+        if name != "made from":
             print(f"  made with       {name} = {value}")
+
+
+def _print_file(contents: exr.Contents) -> None:
+    """Channels, what was taken for what, windows, and what else there is to say."""
+    for found in contents.layers:
+        each = found.taken_for.items()
+        taken = [f"{role} ({', '.join(names)})" for role, names in each]
+        taken = taken if len(taken) > 1 else list(found.taken_for)
+        taken = f": {', '.join(taken)}" if taken else ""
+        part = f"part {found.part}: " if found.part else ""
+        print(f"  channels        {part}{', '.join(found.names)} ({found.kind}){taken}")
+    for role, others in contents.rivals.items():
+        option = "layer" if role == "color" else role
+        also = f"  could be {role}, too: {', '.join(others)}"
+        print(also + (f" (--{option})" if option in _NAMED else ""))
+    for note in contents.notes:
+        print(f"  note            {note}")
+    if contents.window != contents.display:
+        left, top, *_ = contents.window
+        x, y, width, height = contents.display
+        print(f"  window          at {left}, {top} of {width}x{height} at {x}, {y}")
+    if contents.chromaticities is not None:
+        values = ", ".join(f"{value:g}" for value in contents.chromaticities)
+        print(f"  chromaticities  {values}")
+
+
+_NAMED = ("layer", "albedo", "normal", "variance")  # options
+
+
+def _print_frame(frame: Frame, luminance: float) -> None:
+    """Size, samples, and the range of every buffer."""
+    count = frame.sub_buffers
+    print(f"  size            {tables.size(frame)}")
+    spp = tables.samples(frame)
+    print(f"  samples         {spp} a pixel in {count} sub-buffer(s)")
+    print(f"  invalid pixels  {int((~frame.valid).sum())}")
+    print(f"  median luminance {luminance:.4g}")
+    if frame.buffers.variance is None and count < 2:
+        print("  noise           unknown: neither variance nor half buffers (--halves)")
+    stored: dict[str, Any] = {
+        n: b for n, b in frame.buffers._asdict().items() if b is not None
+    }
+    stored |= {f"biased {name}": e.image for name, e in frame.estimates.items()}
+    if frame.reference is not None:
+        stored["reference"] = frame.reference.image
+    for name, buffer in stored.items():
+        _print_range(name, buffer)
+
+
+def _print_range(name: str, buffer: Any) -> None:
+    """The smallest, largest and mean finite value of a buffer."""
+    good = np.asarray(buffer)[np.isfinite(buffer)]
+    low, mean, high = (
+        (good.min(), good.mean(), good.max()) if good.size else (np.nan,) * 3
+    )
+    print(f"  {name:<15} {low:10.4g} .. {high:<10.4g} mean {mean:.4g}")
 
 
 def _all_methods(frame: Frame) -> tuple[dict[str, Image], dict[str, str]]:

@@ -1,6 +1,7 @@
 """`jscomb compare` and `view`: images beside a reference."""
 
 import functools
+import sys
 from collections.abc import Callable, Sequence
 from json import dumps
 from pathlib import Path
@@ -8,10 +9,11 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
-from jaxtyping import Array
 from tqdm import tqdm
 
 from jscomb import exr, metrics
+from jscomb.cli._combining import MAX_MEMORY, MaxMemory
+from jscomb.exr import Contents
 from jscomb.frame import Reference
 from jscomb.numerics.guards import finite
 from jscomb.numerics.tiles import compiled
@@ -73,6 +75,7 @@ def compare(
     metrics: _Names = tuple(METRICS),
     maps: _Folder = None,
     json: _Flag = False,
+    max_memory: MaxMemory = MAX_MEMORY,
 ) -> None:
     """Print the errors of images against a reference.
 
@@ -80,14 +83,15 @@ def compare(
     PSNR and SSIM. PSNR, SSIM, DSSIM and FLIP are of the tone-mapped images.
 
     Args:
-        images: EXR files; their colour is compared. Without --reference the last one is
-            the reference.
+        images: EXR files; of each its denoised image is compared if it has one, else
+            its colour. Without --reference the last one is the reference.
         reference: EXR file; the reference in it if it is a frame that has one, else its
-            colour.
+            denoised image or its colour.
         metrics: what to print; by default all.
         maps: folder for pictures of the errors of every pixel: relative squared error,
             and FLIP where that is installed.
         json: print one line of JSON instead, without numbers that are not finite.
+        max_memory: mebibytes that the pixels of one file may take in memory.
     """
     if unknown := [name for name in metrics or ("",) if name not in METRICS]:
         known = ", ".join(METRICS)
@@ -96,10 +100,11 @@ def compare(
         if len(images) < 2:
             raise ValueError("compare needs an image and a reference: two files")
         images, reference = images[:-1], images[-1]
-    images, truth = tuple(dict.fromkeys(images)), _reference(reference)
-    shown = {name: exr.read_image(path) for name, path in _named(images).items()}
-    for image, path in zip(shown.values(), images, strict=True):
-        _same_size(path, image, reference, truth.image)
+    images, against = tuple(dict.fromkeys(images)), _read(reference, max_memory)
+    truth, shown = _reference(against), {}
+    for name, path in _named(images).items():
+        found = _read(path, max_memory)
+        shown[name] = _beside(found.image, found, against)
     mask = finite(truth.image, *shown.values())
     excluded = int((~mask).sum())
     if excluded == mask.size:
@@ -129,6 +134,7 @@ def view(
     maps: _Names = ("flip",),
     open: _Flag = False,
     tev: _Host = None,
+    max_memory: MaxMemory = MAX_MEMORY,
 ) -> None:
     """Write a page to look at images: panes, flips, errors, values, insets.
 
@@ -138,12 +144,14 @@ def view(
     Args:
         images: EXR files; of a frame its colour and its estimates.
         reference: EXR file; the reference in it if it is a frame that has one, else its
-            colour. By default that of the first frame that has one.
+            denoised image or its colour. By default that of the first frame that has
+            one.
         out: HTML file to write.
         maps: errors to compute beside the relative squared ones: flip, hdr-flip.
         open: open the page in the browser.
         tev: send the images to a tev that runs there instead of writing a page; its
             usual place is localhost:14158.
+        max_memory: mebibytes that the pixels of one file may take in memory.
     """
     from jscomb import viewer  # matplotlib is slow to import
 
@@ -152,7 +160,7 @@ def view(
     if not images:
         raise ValueError("view needs an image: jscomb view FILE ...")
     images = tuple(dict.fromkeys(images))
-    shown, truth = _shown(images, reference)
+    shown, truth = _shown(images, reference, max_memory)
     made, skipped = {}, {}
     if truth is not None and tev is None:
         made = {kind: _maps(kind, shown, truth.image, skipped) for kind in maps}
@@ -177,24 +185,30 @@ def view(
 
 
 def _shown(
-    paths: Sequence[Path], reference: Path | None
+    paths: Sequence[Path], reference: Path | None, max_memory: int
 ) -> tuple[dict[str, Image], Reference | None]:
     """All images of files by a name each, and the reference of them."""
-    truth = None if reference is None else _reference(reference)
+    against = None if reference is None else _read(reference, max_memory)
+    truth = None if against is None else _reference(against)
     shown: dict[str, Image] = {}
     for name, path in _named(paths).items():
-        frame = exr.read_frame(path, statistics=False)
-        if truth is None:
-            truth = frame.reference
-        shown[name] = frame.color
-        for own, estimate in frame.estimates.items():
-            shown[own if len(paths) == 1 else f"{name} {own}"] = estimate.image
-        first = next(iter(shown.values()))
-        _same_size(path, frame.color, paths[0], first)
-    if truth is not None:
-        first = next(iter(shown.values()))
-        _same_size(paths[0], first, reference or paths[0], truth.image)
+        found = _read(path, max_memory)
+        against = against or found
+        if truth is None and found.frame is not None and found.frame.reference:
+            r, noise = found.frame.reference
+            truth = Reference(_beside(r, found, against), noise)
+        for own, image in _images(found).items():
+            title = f"{name} {own}" if own and len(paths) > 1 else own or name
+            shown[title] = _beside(image, found, against)
     return shown, truth
+
+
+def _images(contents: Contents) -> dict[str, Image]:
+    """The colour of a file, without a name, and its estimates."""
+    if contents.frame is None:
+        return {"": contents.image}
+    estimates = contents.frame.estimates
+    return {"": contents.frame.color} | {n: e.image for n, e in estimates.items()}
 
 
 def _named(paths: Sequence[Path]) -> dict[str, Path]:
@@ -204,16 +218,26 @@ def _named(paths: Sequence[Path]) -> dict[str, Path]:
     return {str(path) if whole else path.stem: path for path in paths}
 
 
-def _reference(path: Path) -> Reference:
-    """The reference of a frame that has one, else the colour."""
-    frame = exr.read_frame(path, statistics=False)
-    return frame.reference or Reference(frame.color)
+def _read(path: Path, max_memory: int) -> Contents:
+    """A file; what there is to say of it goes to standard error."""
+    found = exr.read_contents(path, statistics=False, max_bytes=max_memory * 2**20)
+    for note in found.notes:
+        print(f"{path}: {note}", file=sys.stderr)
+    return found
 
 
-def _same_size(path: Path, image: Array, other: Path, another: Array) -> None:
-    """Raise unless two files have images of one size."""
-    if image.shape != another.shape:
-        raise ValueError(f"{path} is {image.shape}, {other} is {another.shape}")
+def _reference(contents: Contents) -> Reference:
+    """The reference of a frame that has one, else the image."""
+    frame = contents.frame
+    return (frame and frame.reference) or Reference(contents.image)
+
+
+def _beside(image: Image, contents: Contents, target: Contents) -> Image:
+    """An image of one file as it goes with another."""
+    made, notes = exr.convert(image, contents, target)
+    for note in notes:
+        print(note, file=sys.stderr)
+    return made
 
 
 def _errors(

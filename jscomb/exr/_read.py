@@ -6,9 +6,9 @@ import pathlib
 from typing import Any
 
 from jscomb.exr import native
-from jscomb.exr._files import MAX_BYTES, read_parts
-from jscomb.exr.dialects import DIALECTS, Options, recognise
-from jscomb.frame import Frame, make_frame
+from jscomb.exr._contents import read_contents
+from jscomb.exr._files import MAX_BYTES, read_headers
+from jscomb.frame import Frame
 from jscomb.typing import Image
 
 
@@ -35,6 +35,7 @@ def read_frame(
     samples: int | None = None,
     dialect: str | None = None,
     statistics: bool = True,
+    layer: str | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Frame:
     """Read a frame that any known renderer, or jscomb itself, has written.
@@ -46,11 +47,13 @@ def read_frame(
             overrides the file. Variances of single samples are divided by it.
         dialect: key of `dialects.DIALECTS`; None to recognise it from the contents.
         statistics: read variances; without them no sample count is needed.
-        max_bytes: memory that the pixels of each file may take; a file that claims
-            more is refused before its pixels are read.
+        layer: the noisy colour, or its stereo view or view layer; None to choose by
+            the usual names.
+        max_bytes: memory that the pixels that are read of each file may take; a file
+            that claims more is refused before its pixels are read.
 
     Returns:
-        the frame, in float32.
+        the frame, in float32, of the file's data window.
 
     Raises:
         FileNotFoundError: if `path` does not exist.
@@ -63,38 +66,36 @@ def read_frame(
         >>> print(frame.color.shape, frame.samples, list(frame.estimates))
         (192, 192, 3) 64.0 ['oidn']
     """
-    path = os.fspath(path)
-    if not os.path.exists(path):
-        raise FileNotFoundError(f"{path}: no such file or directory")
-    if samples is not None and samples < 1:
-        raise ValueError(f"{path}: samples must be at least 1, got {samples}")
-    name = dialect
-    try:
-        name = name or recognise(path)
-        if name not in DIALECTS:
-            known = ", ".join(DIALECTS)
-            raise ValueError(f"unknown dialect {name!r}, expected one of {known}")
-        contents = DIALECTS[name](path, Options(samples, statistics, max_bytes))
-        return contents if isinstance(contents, Frame) else make_frame(**contents)
-    except _MALFORMED as error:
-        if path in str(error):
-            raise ValueError(str(error)) from None
-        raise ValueError(f"{path}: read as {name}: {error}") from None
-
-
-# Raised by attributes and channels of unexpected types, sizes or encodings.
-_MALFORMED = (ValueError, TypeError, AttributeError, KeyError, IndexError)
+    contents = read_contents(
+        path,
+        samples=samples,
+        dialect=dialect,
+        statistics=statistics,
+        layer=layer,
+        max_bytes=max_bytes,
+    )
+    if contents.missing:
+        raise ValueError(contents.missing)
+    if contents.frame is None:
+        raise ValueError(
+            f"{contents.path}: has only a denoised image, "
+            f"{', '.join(contents.color.color or []) if contents.color else ''}"
+        )
+    return contents.frame
 
 
 def read_image(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> Image:
-    """Read the colour of an EXR file of any dialect.
+    """Read the best image of an EXR file of any dialect.
+
+    That is what the renderer or a denoiser has denoised, where the file has it beside
+    the noisy image, else the colour; of a frame in jscomb's own format the colour.
 
     Args:
         path: EXR file, or directory of a Tungsten frame.
         max_bytes: as for `read_frame`.
 
     Returns:
-        the full image, linear radiance, [H,W,3].
+        the image, linear radiance, [H,W,3], of the file's data window.
 
     Raises:
         FileNotFoundError: if `path` does not exist.
@@ -105,7 +106,7 @@ def read_image(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> Image:
         >>> print(exr.read_image(exr.bundled()["cornell-glass-64"]).shape)
         (192, 192, 3)
     """
-    return read_frame(path, statistics=False, max_bytes=max_bytes).color
+    return read_contents(path, statistics=False, max_bytes=max_bytes).image
 
 
 def read_provenance(path: str | os.PathLike) -> dict[str, Any]:
@@ -127,4 +128,4 @@ def read_provenance(path: str | os.PathLike) -> dict[str, Any]:
         >>> print(exr.read_provenance(exr.bundled()["cornell-glass-64"])["spp"])
         64
     """
-    return native.provenance(read_parts(os.fspath(path), header_only=True))
+    return native.provenance(read_headers(os.fspath(path)).parts)

@@ -32,6 +32,7 @@ from jscomb.frame import Buffers, Estimate, Frame, Reference, make_frame
 
 ATTRIBUTE = "jscomb"
 PROVENANCE = "provenance"
+RESULT = "jscombResult"  # of a file with the layers of another program's
 VERSION = 2
 LETTERS = string.ascii_lowercase
 SUFFIXES = {"albedo": "RGB", "normal": "XYZ", "depth": "Z", "visibility": "Y"}
@@ -129,7 +130,7 @@ def _attributes(
         "version": VERSION,
         "samples": None if frame.samples is None else float(frame.samples),
         "sub_buffers": frame.sub_buffers,
-        "crc32": {name: _checksum(channels) for name, channels in parts.items()},
+        "crc32": {name: checksum(channels) for name, channels in parts.items()},
     }
     origin = json.dumps(provenance, default=str)
     about |= {"header crc32": _header_checksum(about, origin)}
@@ -186,7 +187,7 @@ def _checked(parts: list[Part], about: dict[str, Any]) -> dict[str, Part]:
         expected, found = ", ".join(checksums), ", ".join(by_name)
         raise ValueError(f"expected the parts {expected}, found {found}")
     for name, part in by_name.items():
-        found = _checksum(part.channels, names=about["version"] > 1)
+        found = checksum(part.channels, names=about["version"] > 1)
         if found != checksums[name]:
             raise ValueError(f"part {name} is corrupt: its checksum does not match")
     return by_name
@@ -200,6 +201,22 @@ def provenance(parts: list[Part]) -> dict[str, Any]:
     except (TypeError, ValueError):
         found = text  # written by another program
     return found if isinstance(found, dict) else {PROVENANCE: str(found)}
+
+
+def result_of(parts: list[Part]) -> dict[str, Any] | None:
+    """Return which layer of another program's file was combined; None if none was."""
+    for part in parts:
+        try:
+            found = json.loads(part.attributes[RESULT])
+            return {
+                "layer": str(found["layer"]),
+                "part": int(found["part"]),
+                "channels": [str(name) for name in found["channels"]],
+                "crc32": found["crc32"],
+            }
+        except (KeyError, TypeError, ValueError):
+            continue
+    return None
 
 
 def is_native(parts: list[Part]) -> bool:
@@ -218,14 +235,14 @@ def _about(parts: list[Part]) -> dict[str, Any]:
     attributes = _first(parts).attributes
     try:
         about = json.loads(attributes[ATTRIBUTE])
-        version, checksum = about["version"], about.pop("header crc32", None)
+        version, expected = about["version"], about.pop("header crc32", None)
         about = about | {"crc32": dict(about["crc32"])}
         _ = about["sub_buffers"]
     except (TypeError, ValueError, KeyError, AttributeError):
         raise ValueError(f"attribute {ATTRIBUTE} is malformed") from None
     if version not in (1, VERSION):
         raise ValueError(f"unknown format version {version}, known up to {VERSION}")
-    if version > 1 and checksum != _header_checksum(about, attributes.get(PROVENANCE)):
+    if version > 1 and expected != _header_checksum(about, attributes.get(PROVENANCE)):
         raise ValueError(f"attribute {ATTRIBUTE} or {PROVENANCE} is corrupt")
     return about
 
@@ -235,7 +252,7 @@ def _header_checksum(about: dict[str, Any], provenance: Any) -> int:
     return zlib.crc32(json.dumps([about, provenance]).encode())
 
 
-def _checksum(channels: Channels, *, names: bool = True) -> int:
+def checksum(channels: Channels, *, names: bool = True) -> int:
     """Return the CRC-32 of the sorted channel names and the channels' pixels."""
     total = zlib.crc32(" ".join(sorted(channels)).encode()) if names else 0
     for name in sorted(channels):

@@ -173,6 +173,9 @@ def _single(key: Key, frame: Frame, biased: str | Sequence[str] | None) -> Combi
     names = [biased] if isinstance(biased, str) else list(biased or frame.estimates)
     name = "oidn" if not names or "oidn" in names else names[0]
     alone = frame.merged(1)
+    if frame.buffers.variance is None and frame.sub_buffers > 1:  # from their spread
+        buffers = alone.buffers._replace(variance=frame.variance[None])
+        alone = alone._replace(buffers=buffers)
     missing = METHODS["multi-scale"].needs.missing(alone)
     method, tier = ("denoised", "denoised") if missing else ("multi-scale", "fast")
     alone, given = given_to(key, alone, method, name)

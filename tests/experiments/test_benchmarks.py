@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.benchmarks import large, performance, robustness, tiers
+from experiments.benchmarks import files, large, performance, robustness, tiers
 from experiments.benchmarks.work import Work, work_of
 from jscomb import exr
 from tests.conftest import DATA
@@ -100,6 +100,15 @@ def test_robustness_counts_what_is_bad():
     said = robustness.report(found)
     assert said.answer.startswith("1 of 6 attempts end badly; 2 times")
     assert "| foreign |  |  |  | 1 |" in said.body
+
+
+def test_files_are_read_and_written_beside_openexr():
+    found = files.run(files.Config(quick=True))
+    assert found.keys() == files.WAYS.keys()
+    assert all(row.seconds > 0 for row in found.values())
+    said = files.report(found)
+    ratio = found["jscomb, a frame"].seconds / next(iter(found.values())).seconds
+    assert f"takes {ratio:.2f} times" in said.answer
 
 
 @pytest.mark.slow

@@ -58,6 +58,14 @@ def subsampled(sampling: int) -> bytes:
     return assembled({"channels": ("chlist", channels)}, chunks)
 
 
+def luminance_and_chroma() -> bytes:
+    """Return a file of luminance, and chroma at half the resolution along both axes."""
+    channels = _channels("BY", 2, letters=False) + _channels("RY", 2, letters=False)
+    channels += _channels("Y") + b"\0"
+    chunks = [_chunk(y, bytes(4 * (8 + 8 * (y % 2 == 0)))) for y in range(8)]
+    return assembled({"channels": ("chlist", channels)}, chunks)
+
+
 def levels(grey: np.ndarray, mode: int) -> bytes:
     """Return a tiled file of an 8x8 image with its smaller versions.
 
@@ -183,10 +191,10 @@ def _tiles(width: int, height: int, mode: int) -> tuple[str, bytes]:
     return "tiledesc", struct.pack("<IIB", width, height, mode)
 
 
-def _channels(names: str, sampling: int = 1) -> bytes:
-    """Return entries of 32-bit float channels with one-letter names."""
+def _channels(names: str, sampling: int = 1, *, letters: bool = True) -> bytes:
+    """Return entries of 32-bit float channels, of one letter each or one in all."""
     end = b"\0" + struct.pack("<4i", 2, 0, sampling, sampling)
-    return b"".join(name.encode() + end for name in names)
+    return b"".join(name.encode() + end for name in (names if letters else [names]))
 
 
 def _chunk(row: int, pixels: bytes, *, size: int | None = None) -> bytes:

@@ -1,16 +1,12 @@
 """Recognise who wrote an EXR file, and read its channels.
 
-Each dialect has one function from a path to the arguments of `make_frame`. What the
-programs write:
+Each dialect has one function from a path to the arguments of `make_frame`, and one that
+lists the files which that reads. What the programs write:
 
     jscomb     a whole frame, see `native`
+    result     what `jscomb combine` made of a file of another program
     mitsuba    R G B, or <nested>.R with A; <name>.R albedo, <name>.X normal,
                <name>.T depth; m2_<name>.* second moments of single samples
-    pbrt       R G B, Albedo.R, Ns.X (shading) or N.X, Variance.R of one sample
-    blender    Cycles: <view>.Combined.R, <view>.Noisy Image.R where that is denoised;
-               <view>.Denoising Albedo.R, Denoising Normal.X, Denoising Depth.Z (or
-               DiffCol, Normal, Depth); Denoising Variance.R of one sample, from before
-               2.93; attribute cycles.<view>.samples
     tungsten   a directory: color.exr, colorA.exr, colorB.exr, the same for albedo,
                normal, depth, visibility; colorVariance.exr of the mean; <m>/<m>.exr,
                <m>A.exr, <m>B.exr estimates (the layout of Ensemble Denoising)
@@ -24,34 +20,59 @@ programs write:
     oidn       <name>_<samples>spp.hdr.exr, with .alb.exr, .nrm.exr beside it;
                <name>_ref.hdr.exr (reference, gt, target), or the file with the most
                samples, is the reference (training data of Open Image Denoise)
-    rgb        R G B, or Y, and no other known channel
+
+All others are read by the names of their layers, whoever wrote them:
+
+    pbrt       R G B, Albedo.R, Ns.X (shading) or N.X, Variance.R of one sample
+    blender    Cycles: <view>.Combined.R, <view>.Noisy Image.R where that is denoised;
+               <view>.Denoising Albedo.R, Denoising Normal.X, Denoising Depth.Z (or
+               DiffCol, Normal, Depth); Denoising Variance.R of one sample, from before
+               2.93; attribute cycles.<view>.samples
+    layers     any other: R G B or Y, RGBA.R, beauty.R, C.r, Ci.r, Image.R; albedo,
+               diffuse_albedo, N, normal, Z, depth, variance, mse, ... in one part, one
+               part a layer, or one part a view
 """
 
 import os
 import re
 from collections.abc import Callable
+from typing import NamedTuple
 
 from jscomb.exr import native
-from jscomb.exr._files import read_parts
+from jscomb.exr._files import Headers, read_headers, read_pixels
+from jscomb.exr._layers import layers_of
+from jscomb.exr._names import plain
 from jscomb.exr.dialects import _authors, _renderers
-from jscomb.exr.dialects._images import Arguments, Options, rgb, single
-from jscomb.frame import Frame
+from jscomb.exr.dialects._images import Options, Reading, Source
+from jscomb.exr.dialects._layered import layered
 
-__all__ = ["DIALECTS", "Options", "recognise"]
+__all__ = ["DIALECTS", "Dialect", "is_frame", "recognise"]
 
 
-def recognise(path: str) -> str:
+class Dialect(NamedTuple):
+    """How one kind of frame is read.
+
+    Attributes:
+        read: from a source, a path and options to what was read.
+        files: lists what `read` opens, the file with the colour first.
+    """
+
+    read: Callable[[Source, str, Options], Reading]
+    files: Callable[[str], list[str]] = lambda path: [path]
+
+
+def recognise(path: str, *, headers: Headers | None = None) -> str:
     """Return the dialect of a file or directory, from its name and contents.
 
     Args:
         path: EXR file or directory.
+        headers: of the file, where they are read already.
 
     Returns:
         a key of `DIALECTS`.
 
     Raises:
-        ValueError: if the file cannot be read or has no known colour channels; lists
-            its channels.
+        ValueError: if the file cannot be read.
 
     Example:
         >>> from jscomb import exr
@@ -60,53 +81,81 @@ def recognise(path: str) -> str:
     """
     if os.path.isdir(path):
         return "tungsten"
-    parts = read_parts(path, header_only=True)
-    if native.is_native(parts):
+    headers = headers or read_headers(path)
+    if native.result_of(headers.parts) is not None:
+        return "result"
+    if native.is_native(headers.parts):
         return "jscomb"
-    header = parts[0].attributes
-    names = {channel.name for channel in header["channels"]}
-    if any(name.startswith("default.") for name in names):
+    names = {
+        channel.name
+        for part in headers.parts
+        for channel in part.attributes["channels"]
+    }
+    if {"default.R", "subColorA.R"} <= names:
         return "njs"
-    if any(name.endswith(".Combined.R") for name in names):
+    last = {plain(layer.name.rpartition(".")[2]) for layer in layers_of(headers)}
+    if last & {"combined", "noisyimage"}:
         return "blender"
-    if str(header.get("generatedBy", "")).startswith("Mitsuba") or any(
-        name.startswith("m2_") or name.endswith(".T") for name in names
-    ):
+    made_by = str(headers.parts[0].attributes.get("generatedBy", ""))
+    if made_by.startswith("Mitsuba") or any(name.startswith("m2_") for name in names):
         return "mitsuba"
     if {"Variance.R", "Normal.X"} <= names:
         return "pd"
-    if {"Variance.R", "Ns.X", "Nsx", "P.X", "Albedo.R"} & names:
-        return "pbrt"
     if path.endswith(_authors.HDR):
         return "oidn"
     if re.search(rf"{_authors.NUMBERED}\d+\.exr$", path):
         return "idu"
-    if {"R", "G", "B"} <= names or "Y" in names:
-        return "rgb"
-    listed = ", ".join(sorted(names)[:12]) + (", ..." if len(names) > 12 else "")
-    raise ValueError(f"{path}: no colour channels R, G, B (or Y) among {listed}")
+    if {"Variance.R", "Ns.X", "Nsx", "P.X", "Albedo.R"} & names:
+        return "pbrt"
+    return "layers"
 
 
-def _native(path: str, options: Options) -> Frame:
+def is_frame(folder: str) -> bool:
+    """Return whether a directory is one frame, not a folder of them.
+
+    Args:
+        folder: its path.
+
+    Returns:
+        whether it holds Tungsten's images.
+
+    Example:
+        >>> print(is_frame("."))
+        False
+    """
+    names = (os.path.join(folder, f"color{half}.exr") for half in ("", "A"))
+    return any(os.path.isfile(name) for name in names)
+
+
+def _native(source: Source, path: str, options: Options) -> Reading:
     """Read jscomb's own format."""
-    parts = read_parts(path, max_bytes=options.max_bytes)
-    return native.from_parts(parts, options.samples, options.statistics)
+    parts = read_pixels(source.headers(path), max_bytes=options.max_bytes)
+    frame = native.from_parts(parts, options.samples, options.statistics)
+    return Reading({"frame": frame}, path, None, parts, {}, [])
 
 
-def _rgb(path: str, options: Options) -> Arguments:
-    """Read colour alone."""
-    return {"color": rgb(single(path, options), ""), "samples": options.samples}
+def _result(source: Source, path: str, options: Options) -> Reading:
+    """Read a file that jscomb combined: its colour is not noise any more."""
+    about = native.result_of(source.headers(path).parts)
+    assert about is not None
+    wanted = options.wanted
+    if wanted.layer is None:
+        wanted = wanted._replace(layer=about["layer"])
+    found = layered(source, path, options._replace(wanted=wanted))
+    note = "this is a result of jscomb combine: its colour is combined, not noisy"
+    return found._replace(notes=[*found.notes, note])
 
 
-DIALECTS: dict[str, Callable[[str, Options], Arguments | Frame]] = {
-    "jscomb": _native,
-    "mitsuba": _renderers.mitsuba,
-    "pbrt": _renderers.pbrt,
-    "blender": _renderers.blender,
-    "tungsten": _renderers.tungsten,
-    "njs": _authors.njs,
-    "pd": _authors.pd,
-    "idu": _authors.idu,
-    "oidn": _authors.oidn,
-    "rgb": _rgb,
+DIALECTS: dict[str, Dialect] = {
+    "jscomb": Dialect(_native),
+    "result": Dialect(_result),
+    "mitsuba": Dialect(_renderers.mitsuba),
+    "tungsten": Dialect(_renderers.tungsten, _renderers.tungsten_files),
+    "njs": Dialect(_authors.njs),
+    "pd": Dialect(_authors.pd, _authors.pd_files),
+    "idu": Dialect(_authors.idu, _authors.idu_files),
+    "oidn": Dialect(_authors.oidn, _authors.oidn_files),
+    "pbrt": Dialect(layered),
+    "blender": Dialect(layered),
+    "layers": Dialect(layered),
 }

@@ -1,7 +1,7 @@
 """Read the files of the papers' authors, and training data for denoisers.
 
-Each function returns the arguments of `make_frame` for a path; `dialects` lists what is
-in the files.
+Each function reads a path; beside it is one that lists the files which that takes.
+`dialects` lists what is in the files.
 """
 
 import glob
@@ -11,26 +11,31 @@ import re
 
 import numpy as np
 
-from jscomb.exr._files import layers, stack
 from jscomb.exr.dialects._images import (
     Arguments,
     Options,
+    Reading,
+    Source,
     any_image,
     clipped,
     finite_depth,
+    layer_named,
     rgb,
     single,
+    whole,
 )
+from jscomb.exr.dialects._layered import layered
 from jscomb.frame import CHANNELS
 
 HDR = ".hdr.exr"
 NUMBERED = "_(?:rand|corr)Img_"
 
 
-def njs(path: str, options: Options) -> Arguments:
+def njs(source: Source, path: str, options: Options) -> Reading:
     """Read the NJS authors' single file: full buffers, and half A of each."""
-    part = single(path, options)
-    names = layers(part)
+    parts = whole(source, path, options)
+    part = parts[0]
+    names = {name.rpartition(".")[0] for name in part.channels}
 
     def image(layer: str) -> np.ndarray:
         pixels = any_image(part, layer)
@@ -54,51 +59,61 @@ def njs(path: str, options: Options) -> Arguments:
             found[name] = clipped(feature) if name == "albedo" else feature
     if options.statistics and "colorVariance" in names:
         found["variance"] = any_image(part, "colorVariance")
-    return found
+    color = layer_named(source, path, "default")
+    return Reading(found, path, color, parts, {}, [])
 
 
-def pd(path: str, options: Options) -> Arguments:
+def pd(source: Source, path: str, options: Options) -> Reading:
     """Read the PD authors' `<name>.exr`, and the denoised image in a file beside it.
 
     The variance is of the mean: the authors compute SURE from it unchanged.
     """
-    part = single(path, options)
-    name = path.removesuffix(".exr")
-    found: Arguments = {
-        "color": rgb(part, ""),
-        "samples": _samples(name, options),
-        "albedo": clipped(stack(part, "Albedo", "RGB")),
-        "normal": stack(part, "Normal", "XYZ"),
-    }
-    if options.statistics:
-        found["variance"] = stack(part, "Variance", "RGB")
-    beside = f"{name}.den.exr"
-    if os.path.isfile(beside):
-        found["estimates"] = {"denoised": any_image(single(beside, options), "")}
-    return found
+    found = layered(source, path, options, unit="mean")
+    arguments = {"estimates": {}} | found.arguments
+    arguments["samples"] = _samples(path.removesuffix(".exr"), options)
+    for beside in pd_files(path)[1:]:
+        denoised = any_image(single(source, beside, options), "")
+        arguments["estimates"] = {**arguments["estimates"], "denoised": denoised}
+    return found._replace(arguments=arguments)
 
 
-def oidn(path: str, options: Options) -> Arguments:
+def pd_files(path: str) -> list[str]:
+    """Return the frame's file, and the denoised one if it is there."""
+    beside = f"{path.removesuffix('.exr')}.den.exr"
+    return [path, *([beside] if os.path.isfile(beside) else [])]
+
+
+def oidn(source: Source, path: str, options: Options) -> Reading:
     """Read `<name>_<samples>spp.hdr.exr` of Open Image Denoise's training data.
 
     The reference is the file of that name, or the file with the most samples.
     """
-    name = path.removesuffix(HDR)
+    name, present = path.removesuffix(HDR), oidn_files(path)
 
     def image(kind: str) -> np.ndarray | None:
         file = f"{name}.{kind}.exr"
-        return any_image(single(file, options), "") if os.path.isfile(file) else None
+        return any_image(single(source, file, options), "") if file in present else None
 
-    found: Arguments = {
-        "color": rgb(single(path, options), ""),
+    found = layered(source, path, options)
+    arguments = {
+        **found.arguments,
         "samples": _samples(name, options),
         "albedo": clipped(image("alb")),
         "normal": image("nrm"),
     }
     reference = _reference_of(name)
     if reference is not None:
-        found["reference"] = rgb(single(reference, options), "")
-    return found
+        arguments["reference"] = rgb(single(source, reference, options), "")
+    return found._replace(arguments=arguments)
+
+
+def oidn_files(path: str) -> list[str]:
+    """Return the file with the colour, those of the features, and the reference."""
+    name = path.removesuffix(HDR)
+    files = [f"{name}.{kind}.exr" for kind in ("alb", "nrm")]
+    reference = _reference_of(name)
+    present = [file for file in files if os.path.isfile(file)]
+    return [path, *present, *([reference] if reference else [])]
 
 
 def _reference_of(name: str) -> str | None:
@@ -128,16 +143,24 @@ def _samples(name: str, options: Options) -> int | float | None:
     return count if 0 < count < math.inf else None
 
 
-def idu(path: str, options: Options) -> Arguments:
+def idu(source: Source, path: str, options: Options) -> Reading:
     """Read the IDU authors' numbered images as sub-buffers, from the path of any one.
 
     Independent (`_randImg_0`, ...) and correlated (`_corrImg_0`, ...) images are two
     frames. The samples in the names are ignored: whether they count one image or all
     is unknown.
     """
+    files = idu_files(path)
+    first = whole(source, path, options)
+    others = {f: single(source, f, options) for f in files if f != path}
+    images = [any_image(others.get(file, first[0]), "") for file in files]
+    arguments = {"color": np.stack(images), "samples": options.samples}
+    return Reading(arguments, path, layer_named(source, path, ""), first, {}, [])
+
+
+def idu_files(path: str) -> list[str]:
+    """Return all numbered images of the same kind."""
     stem = re.fullmatch(rf"(.*{NUMBERED})\d+\.exr", path, re.S)
     if stem is None:
         raise ValueError("its name does not end in _randImg_ or _corrImg_ and a number")
-    files = sorted(glob.glob(f"{glob.escape(stem[1])}[0-9].exr"))
-    sub_buffers = [any_image(single(file, options), "") for file in files]
-    return {"color": np.stack(sub_buffers), "samples": options.samples}
+    return sorted(glob.glob(f"{glob.escape(stem[1])}[0-9].exr"))

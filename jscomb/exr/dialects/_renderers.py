@@ -1,49 +1,55 @@
-"""Read the files and directories of renderers.
+"""Read Mitsuba's files and Tungsten's directories.
 
-Each function returns the arguments of `make_frame` for a path; `dialects` lists what is
-in the files.
+Each function reads a path; `dialects` lists what is in the files.
 """
 
 import os
 
 import numpy as np
 
-from jscomb.exr._files import Part, layers, stack
+from jscomb.exr._files import Part, stack
 from jscomb.exr.dialects._images import (
     Arguments,
     Options,
+    Reading,
+    Source,
     any_image,
     clipped,
     estimate,
     finite_depth,
+    layer_named,
     rgb,
     single,
     variance_of_mean,
+    whole,
 )
 from jscomb.frame import CHANNELS
 
-FAR = 1e10  # Cycles' depth of the background
 
-
-def mitsuba(path: str, options: Options) -> Arguments:
+def mitsuba(source: Source, path: str, options: Options) -> Reading:
     """Read Mitsuba 3: path, aov around path, and moment around aov.
 
     Second moments of a path directly inside a moment integrator are in CIE XYZ and have
     no variance in RGB; such a file is read without variance.
     """
-    part = single(path, options)
-    names = layers(part)
+    parts = whole(source, path, options)
+    part = parts[0]
+    names = _suffixes(part)
     images = {n: s for n, s in names.items() if n and not n.startswith("m2_")}
     # Only nested integrators have alpha; an RGB layer without it is an albedo.
     radiance = [n for n, s in images.items() if s == "ABGR"]
     moments = [n for n in radiance if f"m2_{n}" in names]
     layer = (moments or radiance or [""])[0]
     found: Arguments = {"color": rgb(part, layer), "samples": options.samples}
+    missing = ""
     if options.statistics and moments:
         deviation = rgb(part, f"m2_{layer}") - np.square(found["color"])
-        found["variance"] = variance_of_mean(
-            deviation, options.samples, "second moments"
-        )
+        try:
+            found["variance"] = variance_of_mean(
+                deviation, options.samples, "second moments"
+            )
+        except ValueError as error:
+            missing = str(error)
     albedo = sorted(
         (n for n, s in images.items() if s == "BGR"), key=lambda n: "alb" not in n
     )
@@ -55,6 +61,16 @@ def mitsuba(path: str, options: Options) -> Arguments:
         found["normal"] = stack(part, normal[0], "XYZ")
     if depth:
         found["depth"] = finite_depth(any_image(part, depth[0]))[..., :1]
+    color = layer_named(source, path, layer)
+    return Reading(found, path, color, parts, {}, [], missing=missing)
+
+
+def _suffixes(part: Part) -> dict[str, str]:
+    """Return the sorted channel suffixes of each layer, by the layer's name."""
+    found: dict[str, str] = {}
+    for name in sorted(part.channels):
+        prefix, _, suffix = name.rpartition(".")
+        found[prefix] = found.get(prefix, "") + suffix
     return found
 
 
@@ -67,53 +83,16 @@ def _are_normals(part: Part, layer: str) -> bool:
     return length.size > 0 and bool(length.max() < 1.01 and np.median(length) > 0.9)
 
 
-def pbrt(path: str, options: Options) -> Arguments:
-    """Read pbrt-v4's GBufferFilm, and its older names."""
-    part = single(path, options)
-    samples = options.samples
-    if samples is None:
-        samples = part.attributes.get("samplesPerPixel")
-        if samples is not None and not isinstance(samples, int):
-            raise ValueError(f"attribute samplesPerPixel is {samples!r}, not a number")
-    found: Arguments = {
-        "color": rgb(part, ""),
-        "samples": samples,
-        "albedo": clipped(stack(part, "Albedo", "RGB")),
-        "normal": _pbrt_normal(part),
-    }
-    variance = stack(part, "Variance", "RGB")
-    if options.statistics and variance is not None:
-        if samples is None:
-            raise ValueError(
-                "its variance is of one sample and the attribute samplesPerPixel is "
-                "missing: give the samples a pixel"
-            )
-        # The film writes 0 where no surface was hit: missing, not exact.
-        buffers = [variance, found["albedo"], found["normal"]]
-        hit = np.any([b != 0 for b in buffers if b is not None], axis=(0, -1))
-        found["variance"] = np.where(hit[..., None], variance / samples, np.nan)
-    return found
-
-
-def _pbrt_normal(part: Part) -> np.ndarray | None:
-    """Return the shading normal, or else the geometric normal."""
-    for layer in ("Ns", "N"):
-        normal = stack(part, layer, "XYZ")
-        older = [part.channels.get(layer + axis) for axis in "xyz"]
-        present = [channel for channel in older if channel is not None]
-        if normal is None and len(present) == 3:
-            normal = np.stack(present, axis=-1).astype(np.float32)
-        if normal is not None:
-            return normal
-    return None
-
-
-def tungsten(path: str, options: Options) -> Arguments:
+def tungsten(source: Source, path: str, options: Options) -> Reading:
     """Read Tungsten's directory of images by name, with A and B for the halves."""
 
     def image(*names: str) -> np.ndarray | None:
         file = os.path.join(path, *names) + ".exr"
-        return any_image(single(file, options), "") if os.path.isfile(file) else None
+        return (
+            any_image(single(source, file, options), "")
+            if os.path.isfile(file)
+            else None
+        )
 
     def halves(*names: str) -> np.ndarray | None:
         *folder, name = names
@@ -143,43 +122,21 @@ def tungsten(path: str, options: Options) -> Arguments:
         if os.path.isdir(os.path.join(path, name))
         and (full := image(name, name)) is not None
     }
-    return found
+    file = tungsten_files(path)[0]
+    parts = whole(source, file, options) if options.everything else []
+    layer = layer_named(source, file, "")
+    return Reading(found, file, layer, parts or source.headers(file).parts, {}, [])
 
 
-def blender(path: str, options: Options) -> Arguments:
-    """Read Blender Cycles: the first view layer, its denoising data and older names.
-
-    Where there is a noisy image, `Combined` is Blender's denoised image.
-    """
-    part = single(path, options)
-    names = layers(part)
-    views = [n.rpartition(".")[0] for n in names if n.endswith(".Combined")]
-    if not views:
-        raise ValueError("it has no layer whose name ends in .Combined")
-    view = min(views, key=lambda v: v == "Composite")  # the compositor's output
-    samples = options.samples
-    if samples is None:
-        text = part.attributes.get(f"cycles.{view}.samples")
-        samples = int(text) if text is not None else None
-
-    def image(*passes: str) -> np.ndarray | None:
-        present = [name for name in passes if f"{view}.{name}" in names]
-        return any_image(part, f"{view}.{present[0]}") if present else None
-
-    combined = rgb(part, f"{view}.Combined")
-    found: Arguments = {
-        "color": combined,
-        "samples": samples,
-        "albedo": clipped(image("Denoising Albedo", "DiffCol")),
-        "normal": image("Denoising Normal", "Normal"),
-    }
-    noisy = image("Noisy Image", "Denoising Image")
-    if noisy is not None:
-        found |= {"color": noisy, "estimates": {"denoised": combined}}
-    depth = image("Denoising Depth", "Depth")
-    if depth is not None:
-        found["depth"] = np.where(depth >= FAR, 0, depth)[..., :1]
-    deviation = image("Denoising Variance", "Denoising Image Variance")
-    if options.statistics and deviation is not None:
-        found["variance"] = variance_of_mean(deviation, samples, "the variance")
+def tungsten_files(path: str) -> list[str]:
+    """Return the images of the directory that are read, the colour's first."""
+    names = [f"color{half}" for half in ("", "A", "B")] + ["colorVariance"]
+    names += [f"{feature}{half}" for feature in CHANNELS for half in ("", "A", "B")]
+    for name in sorted(os.listdir(path)):
+        if os.path.isdir(os.path.join(path, name)):
+            names += [os.path.join(name, f"{name}{half}") for half in ("", "A", "B")]
+    files = [os.path.join(path, f"{name}.exr") for name in names]
+    found = [file for file in files if os.path.isfile(file)]
+    if not found or not os.path.basename(found[0]).startswith("color"):
+        raise ValueError(f"{path}: the directory has neither color.exr nor colorA.exr")
     return found
