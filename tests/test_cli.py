@@ -266,7 +266,7 @@ def test_view(jscomb, tmp_path, glass_frame, monkeypatch):
     for arguments, message in (
         (
             [GLASS, small],
-            r"small\.exr is \(9, 9, 3\), .*glass-64\.exr is \(64, 64, 3\)",
+            r"small\.exr is \(9, 9, 3\), .*glass-64\.exr \(64, 64, 3\)",
         ),
         ([small, "--reference", GLASS], r"small\.exr is \(9, 9, 3\)"),
         ([GLASS, "--maps", "ssim"], "--maps ssim: expected some of flip, hdr-flip"),
