@@ -49,7 +49,9 @@ def main(
     options, found = _called(config, name, doc, lambda options: report(run(options)))
     print(f"{found.answer}\n\n{found.body}")
     if options.report is not None:
-        command = shlex.join(["python", "-m", name, *sys.argv[1:]])
+        # Whose folder it was is nobody's business: absolute paths by their names.
+        words = [pathlib.Path(w).name if w[0:1] == "/" else w for w in sys.argv[1:]]
+        command = shlex.join(["python", "-m", name, *words])
         write(options.report, name, doc, command, found)
 
 
