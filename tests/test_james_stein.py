@@ -184,6 +184,34 @@ def test_whitened_does_not_dominate_in_squared_error():
     assert_mean_below(jnp.sum(5 * x - out, axis=(1, 2, 3)), 0.0)
 
 
+@BOTH
+def test_a_pixel_may_lose_where_its_window_gains(whiten):
+    """Equal variances, y off at one pixel: an error that weighs it most is larger."""
+    bias = jnp.zeros(ONE_WINDOW).at[3, 3].set(2.0)
+    options = {"window": 15, "whiten": whiten, "count": 4000}
+    x, out = errors(jax.random.key(2), bias, jnp.asarray(0.5), **options)
+    assert_mean_below(jnp.sum(out - x, axis=(1, 2, 3)), 0.0)
+    assert_mean_below((2 * x - out)[:, 3, 3, 0], 0.0)
+
+
+@BOTH
+def test_a_dark_pixel_beside_a_light_may_lose_in_relative_error(whiten):
+    """The light is noisy, and y spreads it: the plain error falls, the other rises."""
+    truth = jnp.full(ONE_WINDOW, 0.1).at[3, 3].set(100.0)
+    sigma, y = truth / 5, jnp.full(ONE_WINDOW, 2.0).at[3, 3].set(100.0)
+    pooled = jnp.broadcast_to(jnp.mean(sigma**2), ONE_WINDOW)  # as robust ones are
+
+    def one(key):
+        x = truth + sigma * jax.random.normal(key, ONE_WINDOW)
+        out = james_stein.combine(x, y, pooled, window=15, whiten=whiten)
+        return jnp.square(x - truth), jnp.square(out - truth)
+
+    x, out = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), 4000))
+    assert_mean_below(jnp.sum(out - x, axis=(1, 2, 3)), 0.0)
+    relative = jnp.square(truth[None]) + 0.01
+    assert_mean_below(jnp.sum((10 * x - out) / relative, axis=(1, 2, 3)), 0.0)
+
+
 @pytest.mark.parametrize("bias", [0.0, 0.3, 3.0])
 @BOTH
 def test_dominates_when_windows_overlap(bias, whiten):

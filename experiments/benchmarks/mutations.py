@@ -82,9 +82,9 @@ MUTATIONS = (
     ),
     Mutation(
         "ensemble, over windows: each half judged by itself",
-        "ensemble/_estimate.py",
-        "Evidence(one(y_a, means[0], x_b), one(y_b, means[1], x_a), valid)",
-        "Evidence(one(y_a, means[0], x_a), one(y_b, means[1], x_b), valid)",
+        "ensemble/_evidence.py",
+        "Evidence(one(y_a, x_b, variance_b), one(y_b, x_a, variance_a), count)",
+        "Evidence(one(y_a, x_a, variance_b), one(y_b, x_b, variance_a), count)",
         "test_ensemble.py",
     ),
     Mutation(
@@ -97,15 +97,15 @@ MUTATIONS = (
     Mutation(
         "double shrinkage: share of the wrong integrator",
         "double_shrinkage/_combine.py",
-        "Factors(weighted_ratio(v, v + m)",
-        "Factors(weighted_ratio(m, v + m)",
+        "jnp.where(lost, 1.0, weighted_ratio(e, e + o))",
+        "jnp.where(lost, 1.0, weighted_ratio(o, e + o))",
         "test_double_shrinkage.py",
     ),
     Mutation(
         "double shrinkage: the prior's share and the rest swapped",
         "double_shrinkage/_combine.py",
-        "k2 * p + (1 - k2) * share.blend(u, b)",
-        "(1 - k2) * p + k2 * share.blend(u, b)",
+        "share.prior * p + (1 - share.prior) * share.blend(u, b)",
+        "(1 - share.prior) * p + share.prior * share.blend(u, b)",
         "test_double_shrinkage.py",
     ),
     Mutation(
@@ -125,8 +125,8 @@ MUTATIONS = (
     Mutation(
         "progressive: the noise of the channels' mean divided by C, not C squared",
         "progressive/_combine.py",
-        "keepdims=True) / channels**2",
-        "keepdims=True) / channels",
+        "keepdims=True) / variance.shape[-1] ** 2",
+        "keepdims=True) / variance.shape[-1]",
         "test_progressive.py",
     ),
     Mutation(

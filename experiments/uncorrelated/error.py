@@ -61,6 +61,13 @@ class Config(Options):
     windows: tuple[int, ...] = (7, 11, 15, 21)
 
 
+FORMS = {
+    "of y": {"guides": "independent"},
+    "of both": {"guides": "both"},
+    "a gamma a region": {"region": 65},
+}
+
+
 def frame_pair(
     scene: pathlib.Path, samples: int, reference: Reference, work: pathlib.Path
 ) -> tuple[Frame, Frame]:
@@ -126,6 +133,9 @@ def measure(independent: Frame, correlated: Frame, windows: tuple[int, ...]) -> 
         name = f"uncorrelated {window}x{window}"
         images[name] = uncorrelated.combine_frame(y_frame, z_frame, window=window).image
         gammas[name] = uncorrelated.select_gamma_frame(y_frame, z_frame, window=window)
+    for name, form in FORMS.items():
+        made = uncorrelated.combine_frame(y_frame, z_frame, **form)
+        images[f"uncorrelated, {name}"] = made.image
     gammas["uncorrelated, all rows judged"] = select(y, z, n, stride=1)
     solve = jax.jit(jax.vmap(with_gradients))
     images["L2"] = solve(y_frame.color[None], z_frame.color[None])[0]

@@ -161,8 +161,8 @@ def denoise_selected(
         >>> x = jnp.asarray(np.random.default_rng(0).normal(1, 0.5, (16, 16, 1)))
         >>> v, none = jnp.full_like(x, 0.25), x[..., :0]
         >>> made = denoise_selected(jax.random.key(0), x, v, none, window=9)
-        >>> print(f"{x.std():.2f} {made.std():.2f}")
-        0.51 0.09
+        >>> print(made.std() < 0.2 * x.std())
+        True
 
     Source: Rousselle et al. 2013, section 5; the divergence of SURE by a random probe.
     """
@@ -283,8 +283,8 @@ def denoise_selected_frame(key: Key, frame: Frame, *, window: int = 21) -> Estim
         >>> noise = np.random.default_rng(0).normal(1, 0.5, (2, 16, 16, 1))
         >>> frame = make_frame(noise, variance=np.full_like(noise, 0.25))
         >>> made = denoise_selected_frame(jax.random.key(0), frame, window=9)
-        >>> print(f"{frame.color.std():.2f} {made.image.std():.2f}")
-        0.36 0.08
+        >>> print(made.image.std() < 0.3 * frame.color.std())
+        True
 
     Source: Rousselle et al. 2013.
     """

@@ -23,6 +23,8 @@ a lower expected squared error than x, whatever y is: summed over the window for
 variances, and in units of the variance for the whitened rule, which needs no equality.
 In plain squared error the whitened rule can be worse than x under unequal variances:
 where y is off at the one noisy pixel of a window, all its pixels say that y is right.
+Both are about a window's sum. A single pixel can lose, and so can a relative error,
+which weighs dark pixels more: beside a noisy light that y spreads it loses much.
 A denoised y does depend on x, and path-traced noise is not Gaussian, so in practice
 neither is a guarantee: at low sample counts a good denoiser alone is often better.
 The divergence of the denoiser, D_i = (J Sigma)_ii, corrects for the dependence:

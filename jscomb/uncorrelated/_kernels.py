@@ -49,10 +49,13 @@ def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
     check_rate(gamma, samples)
 
     def kernel(*differences: Array) -> Array:
-        d = jnp.stack(differences)
-        square = jnp.sum(jnp.square(d - jnp.mean(d, axis=0, keepdims=True)), axis=0)
-        rate = rate_of(gamma, samples, d.dtype)
-        return jnp.exp(-2 * rate / (len(d) - 1) * square)
+        first, *others = differences
+        rate, count = rate_of(gamma, samples, first.dtype), len(differences)
+        if count == 2:  # the same in fewer operations
+            return jnp.exp(-rate * jnp.square(first - others[0]))
+        mean = sum(others, start=first) / count
+        square = sum(jnp.square(d - mean) for d in differences)
+        return jnp.exp(-2 * rate / (count - 1) * square)
 
     return kernel
 
