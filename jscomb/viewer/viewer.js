@@ -323,7 +323,6 @@ function makeViewer(root, { scenes, colours }) {
           const changed = [...range(kind)], logarithmic = ERRORS[kind]?.logarithmic;
           changed[which] = Number(event.target.value);
           if (changed[0] < changed[1] && !(logarithmic && changed[0] <= 0)) state.ranges[kind] = changed;
-          event.target.blur();
           draw();
         } });
       const ends = kind === "signed" ? [made("span", { textContent: `−${round(high, 3)}` }), canvas, limit(1)] : [limit(0), canvas, limit(1)];
@@ -409,6 +408,7 @@ function makeViewer(root, { scenes, colours }) {
   };
   addEventListener("hashchange", () => { if (location.hash !== last) start(); });
   addEventListener("resize", draw);
+  root.addEventListener("change", event => event.target.type === "range" || event.target.blur());  // keys are the viewer's again
   root.tabIndex = 0;
   (root.dataset.address === "yes" ? window : root).addEventListener("keydown", press);
   root.viewer = { state, draw, written };
