@@ -246,6 +246,15 @@ def test_shows_errors_by_the_colour_bar(opened, images, scene):
     assert opened.text(".colours span") == "FLIP"
     flip = scene.maps["flip"]["smooth"][..., 0]
     np.testing.assert_allclose(opened.points(1)[..., :3], colours(flip), atol=8)
+    _, high = opened.browser.find_elements("css selector", ".colours input")
+    high.send_keys("\ue009a\ue009", "0.5\n")  # control a selects what is there
+    opened.wait()
+    assert opened.state()["ranges"]["flip"] == [0, 0.5]
+    np.testing.assert_allclose(opened.points(1)[..., :3], colours(2 * flip), atol=8)
+    menu = opened.browser.find_element("css selector", ".pane select")
+    menu.find_element("css selector", "option:nth-of-type(3)").click()
+    opened.wait()
+    assert opened.state()["panes"][0]["image"] == 2
     opened.press("1")  # has no such map
     assert opened.pixels(1).max() == 0
     assert opened.complaints() == []

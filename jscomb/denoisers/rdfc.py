@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from jscomb.denoisers import nonlocal_means
 from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
-from jscomb.numerics.guards import check_same_shape
+from jscomb.numerics.guards import check_same_shape, repeat_channel
 from jscomb.numerics.sure import monte_carlo_sure
 from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import (
@@ -100,6 +100,7 @@ def denoise(
         >>> print([f"{value:.2f}" for value in y.ravel()])
         ['1.00', '1.30', '1.30', '5.00']
     """
+    variance = repeat_channel(variance, guide)
     check_same_shape(image=image, guide=guide, variance=variance)
     if features.shape[:2] != image.shape[:2]:
         raise ValueError(f"features has shape {features.shape}, image {image.shape}")

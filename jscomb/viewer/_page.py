@@ -38,7 +38,7 @@ def page(scenes: Sequence[Scene], *, title: str = "jscomb view") -> str:
         title: of the page.
 
     Returns:
-        HTML that needs nothing else; about four bytes for a channel of a pixel.
+        HTML that needs nothing else; about two bytes for a channel of a pixel.
 
     Raises:
         ValueError: if there is no scene.
