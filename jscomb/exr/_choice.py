@@ -202,14 +202,19 @@ def _variance(
 ) -> tuple[list[Layer], str]:
     """The layers of the variance, and what it is of."""
     if named is not None:
-        name, _, unit = named.rpartition(":")
-        if unit not in _UNITS:
-            name, unit = named, ""
-        found = _named(layers, "variance", name)
-    else:
-        name, unit = "", ""
-        found = _ranked(near, "variance", lambda layer: layer.single)
-    return found, unit or (unit_of(found[0]) if found else "")
+        layer, unit = named_layer(layers, "variance", named)
+        return [layer], unit
+    found = _ranked(near, "variance", lambda layer: layer.single)
+    return found, unit_of(found[0]) if found else ""
+
+
+def named_layer(layers: Sequence[Layer], role: str, given: str) -> tuple[Layer, str]:
+    """Return the layer that a user names for a role, and what a variance is of."""
+    name, _, unit = given.rpartition(":")
+    if role != "variance" or unit not in _UNITS:
+        name, unit = given, ""
+    layer = _named(layers, role, name)[0]
+    return layer, unit or unit_of(layer)
 
 
 def unit_of(layer: Layer) -> str:

@@ -19,6 +19,7 @@ from jscomb.exr.dialects._images import (
     data_window,
     placed,
 )
+from jscomb.exr.dialects._layered import overridden
 from jscomb.frame import Frame, make_frame
 from jscomb.typing import Image
 
@@ -169,7 +170,8 @@ def read_contents(
         if name not in DIALECTS:
             known = ", ".join(DIALECTS)
             raise ValueError(f"unknown dialect {name!r}, expected one of {known}")
-        return _contents(source, name, DIALECTS[name].read(source, path, options))
+        read = DIALECTS[name].read(source, path, options)
+        return _contents(source, name, overridden(source, read, options))
     except _MALFORMED as error:
         if path in str(error):
             raise ValueError(str(error)) from None

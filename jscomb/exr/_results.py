@@ -18,7 +18,13 @@ from jscomb.frame import Frame, make_frame
 Layers = Literal["all", "color"]
 Pixels = Literal["same", "half", "float"]
 ERROR = "error.Y"
-_LOSSY = ("B44", "B44A", "DWAA", "DWAB", "PXR24")
+_LOSSY = {  # which pixel types a codec changes
+    "B44": {np.float16},
+    "B44A": {np.float16},
+    "DWAA": {np.float16, np.float32},
+    "DWAB": {np.float16, np.float32},
+    "PXR24": {np.float32},
+}
 _HALF_MAX = float(np.finfo(np.float16).max)
 _OF_THE_FILE = ("channels", "name", "chunkCount", "version")  # written by the binding
 
@@ -196,7 +202,8 @@ def _lossy(part: Part) -> str:
     """The name of a compression that changes pixels; empty if it does not."""
     name = part.attributes.get("compression", OpenEXR.NO_COMPRESSION).name
     name = name.removesuffix("_COMPRESSION")
-    return name if name in _LOSSY else ""
+    kinds = {plane.dtype.type for plane in part.channels.values()}
+    return name if kinds & _LOSSY.get(name, set()) else ""
 
 
 def _of_layers(attribute: str) -> bool:
