@@ -5,6 +5,7 @@ and status 130, also while the package is still being imported.
 """
 
 import importlib
+import io
 import os
 import sys
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,8 @@ __all__ = [
 
 def main() -> None:
     """Run the command; the entry point of `jscomb`."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names that it cannot show
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with ends_on_interrupt():
             _use_compilation_cache()
