@@ -198,6 +198,20 @@ def test_a_layer_is_named(name, tmp_path):
         exr.read_contents(path, layer="none")
 
 
+def test_doubts_are_told(tmp_path):
+    channels = layer("V.Combined", SMOOTH) | layer("V.Noisy Image", COLOR)
+    path = write(tmp_path / "f.exr", channels)
+    contents = exr.read_contents(path, layer="V.Combined")
+    np.testing.assert_array_equal(contents.image, SMOOTH)
+    assert contents.notes == ["V.Combined may be denoised: V.Noisy Image is beside it"]
+    both = layer("", COLOR) | layer("variance", SMOOTH) | layer("mse", ALBEDO)
+    contents = exr.read_contents(write(path, both))
+    np.testing.assert_array_equal(contents.frame.variance, ALBEDO)  # needs no samples
+    assert contents.rivals == {"variance": ["variance"]}
+    with pytest.raises(ValueError, match="no colour channels"):
+        exr.read_contents(write(path, layer("C", NORMAL, "XYZ")))
+
+
 def test_sides_are_views_without_attributes(tmp_path):
     channels = layer("left", COLOR) | layer("right", SMOOTH)
     channels |= layer("right.albedo", ALBEDO)
@@ -290,6 +304,10 @@ def test_chromaticities(tmp_path):
     for contents, weights in ((plain, rec_709), (wide, own)):
         expected = np.median(COLOR @ weights)
         np.testing.assert_allclose(contents.median_luminance, expected, rtol=1e-3)
+    name = write(tmp_path / "n.exr", layer("", COLOR), colorInteropID="lin_ap1_scene")
+    named = exr.read_contents(name)
+    np.testing.assert_allclose(named.chromaticities, ap1, rtol=1e-6)
+    assert exr.convert(COLOR, wide, named)[1] == []
     unstated, notes = exr.convert(COLOR, plain, wide)
     np.testing.assert_array_equal(unstated, COLOR)
     assert "states no chromaticities" in notes[0]

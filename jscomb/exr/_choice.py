@@ -87,7 +87,7 @@ def choose(layers: Sequence[Layer], wanted: Wanted = Wanted()) -> Choice:  # noq
         _alpha([main, *denoised, *near]),
         variance[0] if variance else None,
         unit,
-        _notes(color, denoised, rivals),
+        [*_notes(color, denoised, rivals), *_doubt(color, near)],
         {role: others for role, others in rivals.items() if others},
     )
 
@@ -251,6 +251,14 @@ def _notes(
         names = ", ".join(layer.shown for layer in others)
         notes.append(f"the colour is {shown}; --layer takes another: {names}")
     return notes
+
+
+def _doubt(color: Layer | None, near: Sequence[Layer]) -> list[str]:
+    """A line if the colour, as a user names it, is beside a noisy image."""
+    noisy = _ranked(near, "noisy", lambda layer: layer.color)
+    if color is None or color.rank("noisy") is not None or not noisy:
+        return []
+    return [f"{color.shown} may be denoised: {noisy[0].shown} is beside it"]
 
 
 def _no_color(layers: Sequence[Layer]) -> str:
