@@ -278,6 +278,15 @@ def test_the_error_is_a_layer(tmp_path):
     contents = exr.read_contents(path, everything=True)
     exr.write_contents(out, contents, SMOOTH, error=X[..., None])
     assert same(whole(out)[1][2]["error.Y"], X)
+    own = write(tmp_path / "own.exr", layer("", COLOR) | {"error.Y": X})
+    for error in (None, 2 * X[..., None]):  # another program's stays
+        exr.write_contents(
+            out, exr.read_contents(own, everything=True), SMOOTH, error=error
+        )
+        ((_, _, channels),) = whole(out)
+        assert same(channels["error.Y"], X)
+        assert ("jscomb.error.Y" in channels) == (error is not None)
+    exr.write_contents(out, contents, SMOOTH, error=X[..., None])
     assert exr.read_result(out) == {}
     exr.write_contents(out, contents, SMOOTH, provenance={"made": "today"})
     assert exr.read_result(out) == {"made": "today"}

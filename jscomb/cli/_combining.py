@@ -198,7 +198,8 @@ def _combine_sequence(jobs: Sequence[Job], options: Options, limits: Limits) -> 
         try:
             _combine_job(job, options, limits)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
-            print(f"{job.frame}: {' '.join(str(error).split())}", file=sys.stderr)
+            why = " ".join(str(error).split()).removeprefix(f"{job.frame}: ")
+            print(f"{job.frame}: {why}", file=sys.stderr)
             failed.append(os.path.basename(os.path.abspath(job.frame)))
     if failed:
         raise ValueError(

@@ -175,9 +175,10 @@ def _like(
         channels = dict(part.channels)
         if number == color.part:
             channels |= new
-            channels.pop(ERROR, None)
             if error is not None:
-                channels[ERROR] = np.asarray(error, np.float32)[..., 0]
+                taken = ERROR in channels and contents.dialect != "result"
+                name = f"jscomb.{ERROR}" if taken else ERROR
+                channels[name] = np.asarray(error, np.float32)[..., 0]
         parts.append(Part(part.name, channels, _attributes(part, lost)))
     return parts, list(dict.fromkeys(lost))
 
