@@ -113,6 +113,12 @@ def test_a_result_is_no_frame(combine):
     assert combine("f.exr", "--biased", "o.exr", "-o", "p.exr")[0] == 0
 
 
+def test_a_noisy_image_in_place_of_a_denoised_one_is_told(combine, here):
+    write(here / "n.exr", layer("", NOISY))
+    status, said, _ = combine("f.exr", "--biased", "n.exr", "-o", "o.exr")
+    assert (status, "n.exr: is the same image as the noisy one" in said) == (0, True)
+
+
 def test_links_stay_links(combine, here):
     (here / "o.exr").symlink_to("store.exr")
     for _ in range(2):

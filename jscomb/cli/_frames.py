@@ -321,6 +321,8 @@ def _with_biased(
     missing = int(np.isnan(image).any(axis=-1).sum())
     if missing and other.window != contents.window:
         notes.append(f"{biased}: lacks {missing} pixels; they stay as they are")
+    if np.array_equal(image, frame.color, equal_nan=True):
+        notes.append(f"{biased}: is the same image as the noisy one")
     name = os.path.basename(os.path.abspath(biased))
     return frame.with_estimate(name, Estimate(image)), name
 

@@ -237,9 +237,9 @@ def _contents(source: Source, dialect: str, read: Reading) -> Contents:
         frame = make_frame(**read.arguments)
     part = read.parts[read.color.part if read.color else 0]
     at = data_window(part)
-    denoised = read.arguments.get("estimates", {}).get("denoised")
-    if denoised is not None:
-        denoised = jnp.asarray(getattr(denoised, "image", denoised))
+    denoised = None
+    if read.choice is not None and read.choice.denoised is not None:
+        denoised = jnp.asarray(read.arguments["estimates"]["denoised"])
     return Contents(
         source.path,
         read.file,
