@@ -76,11 +76,12 @@ _NAMES = {
 
 def __getattr__(name: str) -> Any:
     """Import a room when it is asked for first: JAX is slow to import."""
-    if name in _NAMES:
-        return getattr(importlib.import_module(_NAMES[name]), name)
-    if name in __all__:
-        return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(_NAMES.get(name, f"{__name__}.{name}"))
+    found = getattr(module, name) if name in _NAMES else module
+    globals()[name] = found
+    return found
 
 
 def __dir__() -> list[str]:

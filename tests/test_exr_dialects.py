@@ -228,6 +228,7 @@ def test_pd_files(tmp_path):
     np.testing.assert_array_equal(frame.normal, noise(3, H, W, 3))
     np.testing.assert_array_equal(frame.estimates["denoised"].image, noise(4, H, W, 3))
     assert exr.read_frame(path, samples=8).samples == 8
+    np.testing.assert_array_equal(exr.read_image(path), color)  # not the file beside
 
 
 def test_idu_files(tmp_path):

@@ -113,6 +113,12 @@ def test_a_result_is_no_frame(combine):
     assert combine("f.exr", "--biased", "o.exr", "-o", "p.exr")[0] == 0
 
 
+def test_a_noisy_image_in_place_of_a_denoised_one_is_told(combine, here):
+    write(here / "n.exr", layer("", NOISY))
+    status, said, _ = combine("f.exr", "--biased", "n.exr", "-o", "o.exr")
+    assert (status, "n.exr: is the same image as the noisy one" in said) == (0, True)
+
+
 def test_links_stay_links(combine, here):
     (here / "o.exr").symlink_to("store.exr")
     for _ in range(2):
@@ -360,6 +366,21 @@ def test_a_frame_without_noise_statistics_says_what_helps(combine, here):
     assert "second render with another seed (--halves)" in said
     status, _, error = combine("p.exr", *BIASED, "-o", "q.exr", method="whitened")
     assert (status, "--halves" in error) == (2, True)
+
+
+def test_variances_of_single_samples_without_their_number(combine, here):
+    """Needed where a method takes them; two renders make up for it."""
+    write(here / "p.exr", layer("beauty", NOISY) | layer("variance", VARIANCE))
+    write(here / "q.exr", layer("beauty", OTHER) | layer("variance", VARIANCE))
+    status, said, _ = combine("p.exr", *BIASED, "-o", "a.exr", method="auto")
+    assert (status, "no variance: p.exr: it stores" in said) == (0, True)
+    status, _, error = combine("p.exr", *BIASED, "-o", "b.exr", method="whitened")
+    assert (status, "(--samples)" in error) == (2, True)
+    halves = ("--halves", "q.exr", *BIASED)
+    for number, more in enumerate(((), ("--samples", str(SPP)))):
+        out = f"{number}.exr"
+        assert combine("p.exr", *halves, *more, "-o", out, method="whitened")[0] == 0
+    assert not np.allclose(red("0.exr"), red("1.exr"))
 
 
 def test_features_and_variances_from_files(combine, here):

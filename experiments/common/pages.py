@@ -150,6 +150,8 @@ def main(folder: str) -> None:
     warnings.filterwarnings("ignore", ".*has already been added")  # by its package
     hidden = [f"!{re.escape(name)}" for name in CLOSED]
     pages = pathlib.Path(folder)
+    for name in jscomb.__all__:  # imported when asked for, which pdoc does not
+        getattr(jscomb, name)
     pdoc.pdoc(*modules(), *hidden, output_directory=pages)
     for path in pages.rglob("*.html"):  # pdoc links to private bases, too
         path.write_text(_PRIVATE.sub(r"\1", path.read_text()))

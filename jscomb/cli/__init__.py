@@ -5,6 +5,7 @@ and status 130, also while the package is still being imported.
 """
 
 import importlib
+import io
 import os
 import sys
 from importlib import metadata
@@ -38,6 +39,8 @@ def main() -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"jscomb {metadata.version('jscomb')}, JAX {metadata.version('jax')}")
         return
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names that it cannot show
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with ends_on_interrupt():
             _use_compilation_cache()

@@ -198,7 +198,8 @@ def _combine_sequence(jobs: Sequence[Job], options: Options, limits: Limits) -> 
         try:
             _combine_job(job, options, limits)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
-            print(f"{job.frame}: {' '.join(str(error).split())}", file=sys.stderr)
+            why = " ".join(str(error).split()).removeprefix(f"{job.frame}: ")
+            print(f"{job.frame}: {why}", file=sys.stderr)
             failed.append(os.path.basename(os.path.abspath(job.frame)))
     if failed:
         raise ValueError(
@@ -224,7 +225,8 @@ def _combine_job(job: Job, options: Options, limits: Limits) -> None:
     except ValueError as error:
         raise ValueError(f"{job.frame}: {error}{_remedy(loaded.frame)}") from None
     if made.method != options.method and _lacks_noise(loaded.frame):
-        print(f"{job.frame}: neither variance nor half buffers{_remedy(loaded.frame)}")
+        known = "it has neither variance nor half buffers, so it is denoised only"
+        print(f"{job.frame}: {known}{_remedy(loaded.frame)}")
     if job.folder:
         os.makedirs(job.folder, exist_ok=True)
     _write(job, loaded, made, options, made_from)
@@ -324,7 +326,7 @@ def by_tier(
     made = methods.combine_tier(
         jax.random.key(0), frame, tier=tier, biased=name, budget=budget
     )
-    if made.reason:
+    if made.reason and not _lacks_noise(frame):
         print(made.reason)
     for skipped, reason in made.skipped.items():
         print(f"{skipped}: skipped: {reason}")

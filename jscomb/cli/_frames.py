@@ -142,20 +142,22 @@ def load(sources: Sources, options: Options, max_bytes: int) -> Loaded:
     for name, given in job.features.items():
         if name not in layers:
             frame = _with_feature(frame, name, sources[given], contents, notes, common)
-    if contents.missing and frame.buffers.variance is None:
-        if _needs_variance(options.method):
-            raise ValueError(contents.missing)
-        notes.append(f"no variance: {contents.missing}")
     if job.halves:
         frame = _with_halves(sources, frame, contents, notes, options.layer, common)
+    if contents.missing and frame.buffers.variance is None:
+        if frame.sub_buffers < 2 and _needs_variance(options.method, contents.dialect):
+            raise ValueError(contents.missing)
+        notes.append(f"no variance: {contents.missing}")
     frame, biased = _with_biased(sources, frame, contents, notes, max_bytes)
     return Loaded(contents, frame, biased, notes)
 
 
-def _needs_variance(method: str) -> bool:
-    """Whether a method takes less than all without variance."""
+def _needs_variance(method: str, dialect: str) -> bool:
+    """Whether a method takes a variance, or a tier one that a renderer surely wrote."""
     chosen = methods.METHODS.get(method)
-    return chosen is None or chosen.needs.variance or chosen.takes == "estimates"
+    if chosen is None:
+        return dialect != "layers"
+    return chosen.needs.variance or chosen.takes == "estimates"
 
 
 def _with_feature(
@@ -319,6 +321,8 @@ def _with_biased(
     missing = int(np.isnan(image).any(axis=-1).sum())
     if missing and other.window != contents.window:
         notes.append(f"{biased}: lacks {missing} pixels; they stay as they are")
+    if np.array_equal(image, frame.color, equal_nan=True):
+        notes.append(f"{biased}: is the same image as the noisy one")
     name = os.path.basename(os.path.abspath(biased))
     return frame.with_estimate(name, Estimate(image)), name
 

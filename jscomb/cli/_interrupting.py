@@ -18,7 +18,8 @@ def ends_on_interrupt() -> Iterator[None]:
     Python would only see the signal when a compiled function returns, and an exception
     in a callback of such a function may be lost, so a thread waits for it.
     """
-    if threading.current_thread() is not threading.main_thread():
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         yield
         return
     reader, writer = socket.socketpair()

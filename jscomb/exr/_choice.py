@@ -87,7 +87,7 @@ def choose(layers: Sequence[Layer], wanted: Wanted = Wanted()) -> Choice:  # noq
         _alpha([main, *denoised, *near]),
         variance[0] if variance else None,
         unit,
-        _notes(color, denoised, rivals),
+        [*_notes(color, denoised, rivals), *_doubt(color, near)],
         {role: others for role, others in rivals.items() if others},
     )
 
@@ -202,14 +202,19 @@ def _variance(
 ) -> tuple[list[Layer], str]:
     """The layers of the variance, and what it is of."""
     if named is not None:
-        name, _, unit = named.rpartition(":")
-        if unit not in _UNITS:
-            name, unit = named, ""
-        found = _named(layers, "variance", name)
-    else:
-        name, unit = "", ""
-        found = _ranked(near, "variance", lambda layer: layer.single)
-    return found, unit or (unit_of(found[0]) if found else "")
+        layer, unit = named_layer(layers, "variance", named)
+        return [layer], unit
+    found = _ranked(near, "variance", lambda layer: layer.single)
+    return found, unit_of(found[0]) if found else ""
+
+
+def named_layer(layers: Sequence[Layer], role: str, given: str) -> tuple[Layer, str]:
+    """Return the layer that a user names for a role, and what a variance is of."""
+    name, _, unit = given.rpartition(":")
+    if role != "variance" or unit not in _UNITS:
+        name, unit = given, ""
+    layer = _named(layers, role, name)[0]
+    return layer, unit or unit_of(layer)
 
 
 def unit_of(layer: Layer) -> str:
@@ -246,6 +251,14 @@ def _notes(
         names = ", ".join(layer.shown for layer in others)
         notes.append(f"the colour is {shown}; --layer takes another: {names}")
     return notes
+
+
+def _doubt(color: Layer | None, near: Sequence[Layer]) -> list[str]:
+    """A line if the colour, as a user names it, is beside a noisy image."""
+    noisy = _ranked(near, "noisy", lambda layer: layer.color)
+    if color is None or color.rank("noisy") is not None or not noisy:
+        return []
+    return [f"{color.shown} may be denoised: {noisy[0].shown} is beside it"]
 
 
 def _no_color(layers: Sequence[Layer]) -> str:

@@ -7,18 +7,26 @@ states none is of Rec. 709, as OpenEXR has it.
 from typing import Any
 
 import numpy as np
+import OpenEXR
 
 Chromaticities = tuple[float, ...]
 REC_709: Chromaticities = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 _BRADFORD = np.array(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
+_NAME = "colorInteropID"
 _SAME = 1e-4  # chromaticities that differ by less are rounded ones
 
 
 def stated(attributes: dict[str, Any]) -> Chromaticities | None:
-    """Return the chromaticities of a header; None if it states none that are usable."""
+    """Return the chromaticities of a header; None if it states none that are usable.
+
+    Stated as such, or by the name of a linear colour space.
+    """
     found = attributes.get("chromaticities")
+    known = getattr(OpenEXR, "colorInteropIDToChromaticities", None)
+    if found is None and known and isinstance(attributes.get(_NAME), str):
+        found = known(attributes[_NAME])
     if not isinstance(found, tuple) or len(found) != 8:
         return None
     matrix = _to_xyz(found)

@@ -19,6 +19,7 @@ from jscomb.exr.dialects._images import (
     data_window,
     placed,
 )
+from jscomb.exr.dialects._layered import overridden
 from jscomb.frame import Frame, make_frame
 from jscomb.typing import Image
 
@@ -169,7 +170,8 @@ def read_contents(
         if name not in DIALECTS:
             known = ", ".join(DIALECTS)
             raise ValueError(f"unknown dialect {name!r}, expected one of {known}")
-        return _contents(source, name, DIALECTS[name].read(source, path, options))
+        read = DIALECTS[name].read(source, path, options)
+        return _contents(source, name, overridden(source, read, options))
     except _MALFORMED as error:
         if path in str(error):
             raise ValueError(str(error)) from None
@@ -235,9 +237,9 @@ def _contents(source: Source, dialect: str, read: Reading) -> Contents:
         frame = make_frame(**read.arguments)
     part = read.parts[read.color.part if read.color else 0]
     at = data_window(part)
-    denoised = read.arguments.get("estimates", {}).get("denoised")
-    if denoised is not None:
-        denoised = jnp.asarray(getattr(denoised, "image", denoised))
+    denoised = None
+    if read.choice is not None and read.choice.denoised is not None:
+        denoised = jnp.asarray(read.arguments["estimates"]["denoised"])
     return Contents(
         source.path,
         read.file,

@@ -37,7 +37,7 @@ def read_raw(file: BinaryIO) -> Raw | None:
     """Return the headers at the start of a file; None if they are malformed."""
     try:
         return _read(file)
-    except (struct.error, ValueError, EOFError, KeyError):
+    except (struct.error, ValueError, EOFError, LookupError):
         return None
 
 
@@ -108,6 +108,8 @@ def _safe_list(kind: bytes, value: bytes) -> bytes:
             place = end + 17
         else:
             (count,) = struct.unpack_from("<i", value, place)
+            if count < 0:
+                raise ValueError("a text of negative length")
             start, end = place + 4, place + 4 + count
             place = end
         safe[start:end] = _ascii(value[start:end])

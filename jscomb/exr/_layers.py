@@ -64,8 +64,8 @@ class Layer(NamedTuple):
 
     @property
     def color(self) -> list[str] | None:
-        """The channels of a colour: three, or a grey one."""
-        return self.letters("RGB", "Y")
+        """The channels of a colour: three, or a grey one; not Y of X, Y, Z."""
+        return self.letters("RGB", *([] if "X" in self.channels else ["Y"]))
 
     @property
     def single(self) -> list[str] | None:

@@ -43,19 +43,11 @@ FEATURES = {
 ALPHAS = ("alpha", "a", "opacity")
 # Of the mean, of one sample (the unbiased estimate), or the mean squared deviation.
 VARIANCES = {
-    "denoisingvariance": "deviation",
-    "denoisingimagevariance": "deviation",
-    "variance": "sample",
-    "rgbvariance": "sample",
-    "rgbavariance": "sample",
-    "beautyvariance": "sample",
-    "cvariance": "sample",
-    "mse": "mean",
-    "cimse": "mean",
-    "beautymse": "mean",
-    "colorvariance": "mean",
-    "colourvariance": "mean",
-    "meanvariance": "mean",
+    **dict.fromkeys(("mse", "cimse", "beautymse", "colorvariance"), "mean"),
+    **dict.fromkeys(("colourvariance", "meanvariance"), "mean"),
+    **dict.fromkeys(("denoisingvariance", "denoisingimagevariance"), "deviation"),
+    **dict.fromkeys(("variance", "rgbvariance", "rgbavariance"), "sample"),
+    **dict.fromkeys(("beautyvariance", "cvariance"), "sample"),
 }
 _DENOISED = re.compile(r"(?:denoised?|dn)(.+)|(.+?)(?:denoised?|dn)(?:oidn|optix)?")
 

@@ -18,7 +18,13 @@ from jscomb.frame import Frame, make_frame
 Layers = Literal["all", "color"]
 Pixels = Literal["same", "half", "float"]
 ERROR = "error.Y"
-_LOSSY = ("B44", "B44A", "DWAA", "DWAB", "PXR24")
+_LOSSY = {  # which pixel types a codec changes
+    "B44": {np.float16},
+    "B44A": {np.float16},
+    "DWAA": {np.float16, np.float32},
+    "DWAB": {np.float16, np.float32},
+    "PXR24": {np.float32},
+}
 _HALF_MAX = float(np.finfo(np.float16).max)
 _OF_THE_FILE = ("channels", "name", "chunkCount", "version")  # written by the binding
 
@@ -169,9 +175,10 @@ def _like(
         channels = dict(part.channels)
         if number == color.part:
             channels |= new
-            channels.pop(ERROR, None)
             if error is not None:
-                channels[ERROR] = np.asarray(error, np.float32)[..., 0]
+                taken = ERROR in channels and contents.dialect != "result"
+                name = f"jscomb.{ERROR}" if taken else ERROR
+                channels[name] = np.asarray(error, np.float32)[..., 0]
         parts.append(Part(part.name, channels, _attributes(part, lost)))
     return parts, list(dict.fromkeys(lost))
 
@@ -196,7 +203,8 @@ def _lossy(part: Part) -> str:
     """The name of a compression that changes pixels; empty if it does not."""
     name = part.attributes.get("compression", OpenEXR.NO_COMPRESSION).name
     name = name.removesuffix("_COMPRESSION")
-    return name if name in _LOSSY else ""
+    kinds = {plane.dtype.type for plane in part.channels.values()}
+    return name if kinds & _LOSSY.get(name, set()) else ""
 
 
 def _of_layers(attribute: str) -> bool:

@@ -146,6 +146,11 @@ def _header_claims() -> Iterator[bytes]:
         listed = {"channels": ("chlist", channels + b"\0")}
         yield assembled(listed, _rows())
         yield assembled(listed | {"dataWindow": _box(0, 0, 999, 999)}, _rows())
+    for count in (-4, -(2**31), INT_MAX, 9):
+        texts = {"x": ("stringvector", struct.pack("<i", count) + b"a\xffcd")}
+        yield assembled(texts, _rows())
+    for listed in (b"Y", b"Y\0" + bytes(9), b"\xff\0" + bytes(16), b""):
+        yield assembled({"channels": ("chlist", listed)}, _rows())
     whole = assembled({"x": ("string", b"abcd")}, _rows())
     for size in (INT_MAX, 2**28, -1, -INT_MAX - 1):
         yield whole.replace(b"\4\0\0\0abcd", struct.pack("<i", size) + b"abcd")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jscomb.exr._choice import Choice, channels_of, choose
+from jscomb.exr._choice import Choice, channels_of, choose, named_layer
 from jscomb.exr._files import Headers, Part, read_pixels
 from jscomb.exr._layers import Layer, layers_of
 from jscomb.exr.dialects._images import (
@@ -67,6 +67,31 @@ def layered(
         missing,
         alpha,
     )
+
+
+def overridden(source: Source, read: Reading, options: Options) -> Reading:
+    """Take layers that a user names, where a dialect has chosen by itself.
+
+    Raises:
+        ValueError: if the dialect has no layers, or a name is not among them.
+    """
+    given = options.wanted._asdict()
+    wanted = {name: layer for name, layer in given.items() if layer is not None}
+    if read.choice is not None or not wanted:
+        return read
+    if read.color is None or "layer" in wanted:
+        named = ", ".join(f"--{name}" for name in wanted)
+        raise ValueError(f"its layers cannot be chosen ({named})")
+    layers = layers_of(source.headers(read.file))
+    arguments, missing = dict(read.arguments), read.missing
+    for name, layer in wanted.items():
+        found, unit = named_layer(layers, name, layer)
+        image = _image(read.parts, found, name, read.color)
+        if name == "variance":
+            images = {"variance": image, "color": np.asarray(arguments["color"])}
+            image, missing = _variance(images, options.samples, unit, found), ""
+        arguments[name] = clipped(image) if name == "albedo" else image
+    return read._replace(arguments=arguments, missing=missing)
 
 
 def _skipped(headers: Headers) -> list[str]:
