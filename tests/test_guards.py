@@ -7,7 +7,13 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb import james_stein, metrics
-from jscomb.denoisers import bilateral, nonlocal_means, rdfc, smoothing
+from jscomb.denoisers import (
+    bilateral,
+    kernel_predicting,
+    nonlocal_means,
+    rdfc,
+    smoothing,
+)
 from jscomb.numerics import (
     guards,
     kernels,
@@ -183,6 +189,36 @@ def test_a_batch_and_several_windows_say_what_helps(name):
         with pytest.raises(ValueError, match=static):
             mapped(lambda window: function(x, window))(jnp.array([3, 5]))
     assert jax.vmap(lambda x: function(x, 3))(jnp.stack([x, x])).shape == (2, 6, 5, 3)
+
+
+def images(seed):
+    return jax.random.uniform(jax.random.key(seed), (6, 5, 3))
+
+
+even = lambda x, v, f: kernels.Kernels(x, lambda x: jnp.ones((*x.shape[:2], 9)), 0, 3)
+key = lambda: jax.random.key(0)
+OF_VARIANCE = {
+    "james_stein.combine": lambda x, y, v: james_stein.combine(x, y, v, window=3),
+    "james_stein.risk": lambda x, y, v: james_stein.risk(x, y, v, window=3),
+    "sure": lambda x, y, v: sure.monte_carlo_sure(key(), jnp.sin, x, v),
+    "exact": lambda x, y, v: sure.exact_sure(jnp.sin, x, v),
+    "pooled": lambda x, y, v: sure.pooled(sure.Risk(x, x, x), x, v, window=3),
+    "bilateral": lambda x, y, v: bilateral.denoise(x, v, y, window=3),
+    "nonlocal means": lambda x, y, v: nonlocal_means.denoise(
+        x, y, v, window=3, patch=1
+    ),
+    "rdfc": lambda x, y, v: rdfc.denoise(x, y, v, y, window=3, patch=1),
+    "kernels": lambda x, y, v: kernel_predicting.denoise(even, x, v, y),
+}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", OF_VARIANCE)
+def test_a_variance_of_one_channel_is_that_of_each(name):
+    function, x, y, v = OF_VARIANCE[name], *map(images, range(3))
+    found = function(x, y, v[..., :1])
+    expected = function(x, y, jnp.broadcast_to(v[..., :1], v.shape))
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 @pytest.mark.usefixtures("unchecked")

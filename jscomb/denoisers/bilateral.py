@@ -19,7 +19,12 @@ from jaxtyping import Array, Float
 
 from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
-from jscomb.numerics.guards import check_same_shape, finite, first_finite
+from jscomb.numerics.guards import (
+    check_same_shape,
+    finite,
+    first_finite,
+    repeat_channel,
+)
 from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import bilateral_weights, weighted_mean
 from jscomb.numerics.windows import reach_of, window_mean
@@ -69,6 +74,7 @@ def denoise(
         >>> print([f"{value:.1f}" for value in found.ravel()])
         ['2.0', '2.0', '6.0', '6.0']
     """
+    variance = repeat_channel(variance, image)
     check_same_shape(image=image, variance=variance)
     if features.shape[:2] != image.shape[:2]:
         raise ValueError(f"features has shape {features.shape}, image {image.shape}")

@@ -18,6 +18,7 @@ from jscomb.frame import Frame, Needs
 from jscomb.numerics.guards import (
     check_same_shape,
     first_finite,
+    repeat_channel,
     weighted_ratio,
     zero_invalid,
 )
@@ -66,6 +67,7 @@ def denoise(
         >>> print([f"{value:.2f}" for value in y.ravel()])
         ['1.50', '3.00', '4.00']
     """
+    variance = repeat_channel(variance, noisy)
     check_same_shape(noisy=noisy, variance=variance)
     denoise_one = lambda x, v: denoise_normalised(network, x, v, features)
     return at_unit_luminance(denoise_one, noisy, squares=[variance])

@@ -27,7 +27,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.frame import Estimate, Frame, Needs, with_halves
-from jscomb.numerics.guards import check_same_shape, divide, finite
+from jscomb.numerics.guards import check_same_shape, divide, finite, repeat_channel
 from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import Pairs, Weights, normalised_distance, weighted_mean
 from jscomb.numerics.windows import check_window, reach_of
@@ -117,6 +117,7 @@ def weights(
 
     Source: Rousselle et al. 2013.
     """
+    variance = repeat_channel(variance, guide)
     check_same_shape(guide=guide, variance=variance)
     if isinstance(strength, int | float) and not strength > 0:
         raise ValueError(f"strength must be positive, got {strength}")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jscomb.denoisers import nonlocal_means
 from jscomb.features import stack
 from jscomb.frame import Estimate, Frame, Needs, with_halves
-from jscomb.numerics.guards import check_same_shape
+from jscomb.numerics.guards import check_same_shape, repeat_channel
 from jscomb.numerics.tiles import Local, compiled
 from jscomb.numerics.weights import feature_weights, minimum_of, weighted_mean
 from jscomb.typing import Image, Variance
@@ -68,6 +68,7 @@ def denoise(
         >>> print([f"{value:.2f}" for value in y.ravel()])
         ['1.00', '1.30', '1.30', '5.00']
     """
+    variance = repeat_channel(variance, guide)
     check_same_shape(image=image, guide=guide, variance=variance)
     if features.shape[:2] != image.shape[:2]:
         raise ValueError(f"features has shape {features.shape}, image {image.shape}")

@@ -8,6 +8,7 @@ from jscomb.numerics.guards import (
     divide,
     finite,
     first_finite,
+    repeat_channel,
     zero_invalid,
 )
 from jscomb.numerics.windows import check_window, reach_of, window_mean, window_sum
@@ -140,6 +141,7 @@ def prepare(
     unbiased: Image, biased: Image, variance: Variance, window: int
 ) -> tuple[Mask, Image, Image, Variance]:
     """Check shapes and window; the valid pixels, and the images with 0 elsewhere."""
+    variance = repeat_channel(variance, unbiased)
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance)
     if check_window(window) < 3:
         raise ValueError(f"window must be at least three, got {window}")

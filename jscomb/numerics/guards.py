@@ -24,6 +24,7 @@ __all__ = [
     "finite",
     "first_finite",
     "masked_mean",
+    "repeat_channel",
     "safe_sqrt",
     "weighted_ratio",
     "zero_invalid",
@@ -85,6 +86,25 @@ def check_image(**images: Float[Array, "..."]) -> None:
             batch = ": for a batch of images map the function by jax.vmap"
             what = f"{name} must have shape [H, W, C], got {image.shape}"
             raise ValueError(what + batch * (image.ndim == 4))
+
+
+def repeat_channel(variance: Float[Array, "..."], image: Float[Array, "..."]) -> Array:
+    """Return a variance with one channel for every channel of its image.
+
+    Args:
+        variance: [H,W,1], or of the image's shape.
+        image: [H,W,C].
+
+    Returns:
+        the variance, [H,W,C]; unchanged if it is neither, for a check to say so.
+
+    Example:
+        >>> print(repeat_channel(jnp.ones((4, 5, 1)), jnp.ones((4, 5, 3))).shape)
+        (4, 5, 3)
+    """
+    if image.ndim == 3 and variance.shape == (*image.shape[:2], 1):
+        return jnp.broadcast_to(variance, image.shape)
+    return variance
 
 
 def check_static(**options: object) -> None:

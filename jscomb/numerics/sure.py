@@ -35,6 +35,7 @@ from jscomb.numerics.guards import (
     check_same_shape,
     check_static,
     finite,
+    repeat_channel,
     safe_sqrt,
     zero_invalid,
 )
@@ -115,6 +116,7 @@ def monte_carlo_sure(
         raise ValueError(f"probe must be one of {get_args(Probe)}, got {probe!r}")
     if slope_limit is not None and not slope_limit > 0:
         raise ValueError(f"slope_limit must be positive, got {slope_limit}")
+    variance = repeat_channel(variance, noisy)
     deviation = _deviation(noisy, variance)
     draw = jax.random.rademacher if probe == "rademacher" else jax.random.normal
 
@@ -163,6 +165,7 @@ def exact_sure(
         >>> print(risk.squared_error[0, 0], risk.divergence[0, 0])
         [-0.5] [0.25]
     """
+    variance = repeat_channel(variance, noisy)
     deviation = _deviation(noisy, variance).ravel()
     denoised, push = jax.linearize(denoise, noisy)
     _check_denoised(denoised, noisy)
@@ -199,6 +202,7 @@ def pooled(risk: Risk, noisy: Image, variance: Variance, *, window: int) -> Risk
         >>> print(risk.squared_error[0, :, 0])
         [1. 1. 0. 1.]
     """
+    variance = repeat_channel(variance, noisy)
     check_same_shape(noisy=noisy, variance=variance, denoised=risk.denoised)
     valid = finite(noisy, variance)
     mean = lambda image: window_mean(image, window, mask=valid)
