@@ -95,10 +95,10 @@ function makeViewer(root, { scenes, colours }) {
     const canvas = made("canvas"), cross = made("div", { className: "cross", hidden: true }), line = made("div", { className: "line" }), box = made("div", { className: "box" });
     const image = made("select", { onchange: event => { flip(number, event.target.value); draw(); } });
     const kind = made("select", { onchange: event => { state.panes[number].kind = event.target.value; draw(); } });
-    const note = made("span", { className: "note" }), value = made("div", { className: "value" });
+    const note = made("div", { className: "note" }), value = made("div", { className: "value" });
     const stage = made("div", { className: "stage" }, canvas, cross, line, box);
     const view = { number, canvas, cross, line, box, image, kind, note, value, stage,
-      element: made("div", { className: "pane" }, made("div", { className: "head" }, image, kind, note), stage, value) };
+      element: made("div", { className: "pane" }, made("div", { className: "head" }, image, kind), note, stage, value) };
     listen(view);
     return view;
   }
@@ -244,7 +244,7 @@ function makeViewer(root, { scenes, colours }) {
   function paintAll() {
     while (views.length < state.panes.length) views.push(makeView(views.length));
     const ratio = devicePixelRatio || 1, { width, height } = scene(), all = state.panes.length;
-    const room = columns => (innerHeight - 120) / Math.ceil(all / columns) - 66;
+    const room = columns => (innerHeight - 120) / Math.ceil(all / columns) - 88;
     const fits = columns => Math.min(panes.clientWidth / columns / width, room(columns) / height);
     const columns = [1, 2, 3, 4].slice(0, all).reduce((best, each) => fits(each) > fits(best) ? each : best);
     panes.style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
