@@ -169,6 +169,7 @@ def denoise_selected(
     """
     if not candidates:
         raise ValueError("there must be a candidate, got none")
+    variance = repeat_channel(variance, image)
     every, risks = [], []
     for of_probe, candidate in zip(
         jax.random.split(key, len(candidates)), candidates, strict=True
