@@ -149,8 +149,13 @@ def _check(options: Options, limits: Limits) -> None:
         )
     if options.budget is not None and not options.budget >= 0:
         raise ValueError(f"--budget {options.budget}: expected seconds, at least 0")
-    if limits.memory < 0 or limits.max_bytes < 1:
-        raise ValueError("--memory, --max-memory: expected mebibytes")
+    for option, limit in (
+        ("--memory", limits.memory),
+        ("--max-memory", limits.max_bytes),
+    ):
+        if limit < 1:
+            found = f"the budget is {limit // 2**20} MiB"
+            raise ValueError(f"{option}: {found}, expected at least 1")
 
 
 def _jobs(
