@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import experiments
-from experiments.common import archives, command, errors, index, report
+from experiments.common import archives, claims, command, errors, index, report
+from experiments.common.command import Options
 from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.james_stein import error
 
 FOLDERS = sorted(path.parent for path in index.EXPERIMENTS.glob("*/__init__.py"))
+ACCOUNTS = sorted(index.EXPERIMENTS.glob("*/account.py"))
 SECTIONS = [section for folder in FOLDERS for section in report.read(folder)]
 
 
@@ -105,3 +107,24 @@ def test_every_result_is_of_a_command():
         assert " ".join(module.__doc__.split("\n\n")[0].split()) == section.question
         assert "--quick" not in section.command
         assert pathlib.Path(module.__file__).parent in FOLDERS
+
+
+@pytest.mark.parametrize("path", ACCOUNTS, ids=lambda path: path.parent.name)
+def test_an_account_names_what_is_there(path):
+    module = importlib.import_module(f"experiments.{path.parent.name}.account")
+    made = module.report(module.run(Options()))
+    written = claims.sections()[module.__name__]
+    assert written.answer == made.answer
+    assert made.body in written.text
+    items = [claim.item for claim in module.CLAIMS]
+    assert len(set(items)) == len(items)
+
+
+def test_an_account_refuses_what_is_not_there():
+    claim = claims.Claim("eq. 1", "a sum")
+    with pytest.raises(ValueError, match=r"eq\. 1: neither here nor a reason why not"):
+        claims.check([claim])
+    with pytest.raises(ImportError, match=r"no james_stein\.nothing in jscomb"):
+        claims.check([claim._replace(where=("james_stein.nothing",))])
+    with pytest.raises(ValueError, match=r"no result of experiments\.common\.claims"):
+        claims.check([claim._replace(measured=("experiments.common.claims",))])
