@@ -20,7 +20,7 @@ of each come from the other (`radiance_prior`). Without a network, eta^2 comes f
 `prior_error`, and m from halves (`biased_error`) or from passes with different radii
 (`radius_bias`). `combine_frame` does all this for a frame.
 
-Source: C. Zhou et al., "DSCombiner: Double Shrinkage for Combining Estimate and
+Source: C. Zhou et al., "DSCombiner: Double Shrinkage for Combining Biased and
 Unbiased Monte Carlo Renderings", 2025 (DSC; eq. numbers above).
 """
 

@@ -99,7 +99,7 @@ def neural_combine(
         >>> print(fast(network, x, y, y, y, rule=Rule(window=3))[0, 0].round(3))
         [2.674]
 
-    Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.
+    Source: NJS eq. 6, 7, 12, 13; the whitened form is ours.
     """
     check_same_shape(
         unbiased=unbiased, biased_a=biased_a, biased_b=biased_b, variance=variance
@@ -143,7 +143,7 @@ def combine_inputs(
         >>> print(combine_inputs(network, inputs, rule=Rule(7, True))[0, 0].round(3))
         [2.562]
 
-    Source: NJS eq. 6, 7, 10, 13; the whitened form is ours.
+    Source: NJS eq. 6, 7, 12, 13; the whitened form is ours.
     """
     check_same_shape(**inputs)
     window, whiten = rule or rule_of(network)

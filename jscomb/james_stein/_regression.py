@@ -208,7 +208,7 @@ def guide_noise(biased_a: Image, biased_b: Image, *, robust: bool = True) -> Sca
         >>> print(f"{guide_noise(a, b):.3f}")
         0.060
 
-    Source: NJS eq. 11, the text below it.
+    Source: NJS eq. 10, the text below it.
     """
     check_same_shape(biased_a=biased_a, biased_b=biased_b)
     valid = finite(biased_a, biased_b)
