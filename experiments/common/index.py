@@ -20,18 +20,19 @@ def index() -> str:
     """Tabulate all sections.
 
     Returns:
-        Markdown: a table a folder.
+        Markdown: one table, a row a section.
     """
-    parts = []
-    for path in sorted(EXPERIMENTS.glob(f"*/{report.NAME}")):
-        rows = [
-            (s.question, f"`{s.module.partition('.')[2]}`", s.answer, s.date)
-            for s in report.read(path.parent)
-        ]
-        folder = path.parent.name
-        parts.append(f"## [{folder}]({folder}/{report.NAME})")
-        parts.append(table(("question", "command", "answer", "date"), rows))
-    return "\n\n".join(parts)
+    rows = [
+        (
+            s.question,
+            f"[{s.module.partition('.')[2]}]({path.parent.name}/{report.NAME})",
+            s.answer,
+            s.date,
+        )
+        for path in sorted(EXPERIMENTS.glob(f"*/{report.NAME}"))
+        for s in report.read(path.parent)
+    ]
+    return table(("question", "module, its results", "answer", "date"), rows)
 
 
 def indexed(text: str) -> str:

@@ -1,0 +1,338 @@
+"""What of ensemble denoising is here, and what was measured?"""
+
+from experiments.common.claims import Claim
+from experiments.common.claims import account as report
+from experiments.common.command import Options, main
+
+_NOT_YET = "Not measured yet: the experiment's results do not stand here."
+_MEMBERS = "experiments.comparison.members"
+_TIERS = "experiments.comparison.tiers"
+_LEARNED = "experiments.training.learned"
+_SOLVERS = "experiments.ensemble.solvers"
+_TRUTH = "experiments.ensemble.truth"
+_WEIGHTS = "experiments.ensemble.weights"
+
+EQUATIONS = (
+    Claim(
+        "eq. 1, 2",
+        "a base denoiser is a function of the noisy image and the features",
+        where=("frame.Estimate", "methods.METHODS"),
+        note="An estimate is the image with the same made from each half; any program "
+        "can make one.",
+    ),
+    Claim(
+        "eq. 3, 4",
+        "the ensemble: at each pixel a sum of the bases with weights of sum one",
+        where=("ensemble.average",),
+        note="At a pixel where a base is not finite, the first that is.",
+    ),
+    Claim(
+        "eq. 5, 6",
+        "weights of least mean squared error: the minimum of w'Mw",
+        where=("numerics.simplex.quadratic", "numerics.simplex.affine"),
+    ),
+    Claim(
+        "eq. 7, 8",
+        "M_ij = E[(y_i - mu) (y_j - mu)] and its expansion",
+        where=("ensemble.true_matrix",),
+        note="From many renderings and the true image.",
+    ),
+    Claim(
+        "eq. 9, 10",
+        "halves are independent, and taken as uncorrelated after denoising",
+        where=("frame.with_halves",),
+        note="Each half is denoised alone. An estimate that shares what it learned "
+        "from both halves violates it: experiments.ensemble.dependence.",
+    ),
+    Claim(
+        "eq. 11, 12",
+        "`<M>` of each half with the other half's x for the truth, and their mean",
+        where=("ensemble.mse_matrix",),
+    ),
+    Claim(
+        "eq. 13",
+        "minimise w'`<M>`w with weights of sum one, none below zero",
+        where=("ensemble.solve_weights", "numerics.simplex.quadratic"),
+        note="The paper's, of single pixels and channels, is `solver='hull'`. The "
+        "default, 'multi-scale', averages `<M>` over windows and the frame; ours.",
+    ),
+    Claim(
+        "eq. 14",
+        "the same objective without a matrix",
+        where=("numerics.simplex.hull",),
+        note="Solved as the point of a convex hull nearest to (x_b, x_a), exactly. The "
+        "paper prints 2 x^A x^B for x^A x^B, which changes no weight.",
+    ),
+    Claim(
+        "eq. 15, 16",
+        "M of halves; `<M>` is unbiased for it",
+        where=("ensemble.true_matrix", "ensemble.mse_matrix"),
+        note="A test of 400 renderings, by standard errors.",
+    ),
+    Claim(
+        "eq. 17-19",
+        "optimal weights of either sign: M^+ 1 / 1'M^+ 1",
+        where=("numerics.simplex.affine",),
+        note="With a ridge in place of the pseudo-inverse, which takes the wrong limit "
+        "where a combination without error exists; weights are limited to about 1000.",
+    ),
+    Claim(
+        "eq. 20, 21",
+        "with the true M the ensemble has no more error than any base",
+        where=("numerics.simplex.affine", "numerics.simplex.quadratic"),
+        note="Tests: of `affine` on `<M>` of single pixels, of `quadratic` with the "
+        "true M of many renderings.",
+    ),
+    Claim(
+        "eq. 22-26",
+        "the ensemble is consistent if one base is, also with estimated `<M>`",
+        where=("ensemble.combine",),
+        note="A test for both solvers, with x as a base; without it nothing makes an "
+        "ensemble of biased bases consistent. Eq. 24 and 25 print a factor 2 before "
+        "(x^A - x^B)^2 that eq. 27 does not have.",
+    ),
+    Claim(
+        "eq. 27-29",
+        "of two bases in closed form, clipped to [0, 1]",
+        where=("numerics.simplex.two",),
+        note="One half where both bases are equal.",
+    ),
+    Claim(
+        "eq. 30, 31",
+        "the iterative solver: random start, cycles in random order, at most 1024 "
+        "steps",
+        where=("numerics.simplex.iterative",),
+        note="For comparison. All pixels share one order; stops after three cycles "
+        "without change. Not exact where three or more bases mix.",
+    ),
+    Claim(
+        "eq. 32",
+        "a cross-bilateral filter of the weights: radius 7, sigma 3, 2, 0.25 (albedo) "
+        "and 0.15 (normal)",
+        where=("ensemble.filter_weights",),
+    ),
+    Claim(
+        "eq. 33",
+        "colour distance relative to both variances, Var[z] = (z^A - z^B)^2 / 2",
+        where=("ensemble.filter_weights", "ensemble.combine"),
+        note="Summed over channels. A blurred variance, clipped weights and "
+        "standardised normals, as in the authors' program, are options of `Filter`.",
+    ),
+    Claim(
+        "eq. 34, 35",
+        "filtered weights, and the final ensemble with them",
+        where=("ensemble.filter_weights", "ensemble.combine"),
+        note="`filter=True`; off by default, where weights are multi-scale.",
+    ),
+    Claim(
+        "eq. 36, 37",
+        "the error of a base from halves, less both variances, to select one a pixel",
+        where=("ensemble.selection_errors", "ensemble.one_hot"),
+        note="Var[y_i] is a quarter of the halves' squared difference. Unbiased by a "
+        "test.",
+    ),
+)
+
+FIGURES = (
+    Claim(
+        "fig. 1",
+        "close-ups of KPCN, NFOR, MCGAN and RDFC combined; relMSE against samples",
+        where=(_TIERS,),
+        measured=(_TIERS,),
+        note="Other bases and multi-scale weights; no close-ups. Relative L2 over the "
+        "better of path tracing and OIDN: 0.517 (`balanced`) and 0.420 (`best`), "
+        "geometric means of 46 frames, 16 to 4096 samples.",
+    ),
+    Claim(
+        "fig. 2",
+        "the pipeline: bases of full frame and halves, weights, filter, ensemble",
+        where=("ensemble.combine", "ensemble.combine_frame"),
+        note="`solver='hull', filter=True` is the paper's.",
+    ),
+    Claim(
+        "fig. 3, section 5.1",
+        "30 scenes in Tungsten, references of at least 32768 samples; eight bases: "
+        "KPCN, MCGAN, NFOR, OIDN, OptiX, RDFC and deep combiner forms of two",
+        where=(
+            "experiments.data.development",
+            "denoisers.nfor",
+            "denoisers.rdfc",
+            "denoisers.oidn",
+            "denoisers.kernel_predicting",
+        ),
+        note="Eleven scenes in Mitsuba 3. MCGAN, OptiX and the deep combiner are not "
+        "here. RDFC is one filter, or three selected by SURE (`denoise_selected`).",
+    ),
+    Claim(
+        "section 5.1, time",
+        "about one second for the solver, tens of milliseconds for the filter on a GPU",
+        where=(_SOLVERS,),
+        note=_NOT_YET,
+    ),
+    Claim(
+        "fig. 4",
+        "without the limit at zero, pixels' weights turn into fireflies",
+        where=("numerics.simplex.affine", _WEIGHTS),
+        note="The experiment has weights of either sign over 31x31 pixels, not of "
+        "single ones. " + _NOT_YET,
+    ),
+    Claim(
+        "fig. 5",
+        "weights of the iterative and of a general solver look alike",
+        where=(_SOLVERS, "numerics.simplex.reference"),
+        note="By the excess of the objective, with jaxopt's OSQP in place of FBstab. "
+        + _NOT_YET,
+    ),
+    Claim(
+        "fig. 6",
+        "the iterative solver is about ten times as fast as the general one",
+        where=(_SOLVERS,),
+        note="Two to eight bases, with the exact solvers beside them. " + _NOT_YET,
+    ),
+    Claim(
+        "fig. 7",
+        "weights of each channel have slightly less error than shared ones",
+        where=("ensemble.solve_weights", _WEIGHTS),
+        note="`hull` has the paper's, of each channel; multi-scale weights are shared "
+        "unless `shared=False`. " + _NOT_YET,
+    ),
+    Claim(
+        "fig. 8",
+        "filtered weights remove noise and artifacts at edges",
+        where=("ensemble.filter_weights", _WEIGHTS),
+        note=_NOT_YET,
+    ),
+    Claim(
+        "fig. 9",
+        "the plain average has more error than the ensemble at all samples",
+        where=(_WEIGHTS, _TIERS),
+        measured=(_TIERS,),
+        note="With the bases of `best` and multi-scale weights: equal weights have "
+        "4.23 times its error (geometric mean; worst 327). Path tracing is among these "
+        "bases, so the average keeps its noise; the paper averages denoisers only.",
+    ),
+    Claim(
+        "fig. 10",
+        "one-hot selection, errors filtered before or selection after: seams; the "
+        "ensemble has the least relMSE",
+        where=("ensemble.combine", _WEIGHTS),
+        note="`solver='one-hot'` with `filter=True` filters after; the experiment "
+        "filters before by a cross-bilateral filter and by non-local means. "
+        + _NOT_YET,
+    ),
+    Claim(
+        "table 1",
+        "the ensemble beats both one-hot forms that filter before in 74.9 % of cases",
+        where=(_WEIGHTS,),
+        note="Errors of these forms, not the share of cases. " + _NOT_YET,
+    ),
+    Claim(
+        "table 2",
+        "the ensemble beats the one-hot form that filters after in 72.3 % of cases",
+        where=(_WEIGHTS,),
+        note="As table 1. " + _NOT_YET,
+    ),
+    Claim(
+        "fig. 11",
+        "weights by the true M, of full frames and of halves, one-hot and of either "
+        "sign, beside estimated ones: 1024 renderings of 256 samples",
+        where=(_TRUTH, "ensemble.true_matrix"),
+        note="32 renderings of 64 samples by default, with weights of at least zero "
+        "only: neither one-hot nor of either sign. " + _NOT_YET,
+    ),
+    Claim(
+        "section 5.3.1",
+        "39 candidates: 8 bases and 31 of their 247 combinations",
+        where=(_WEIGHTS, _MEMBERS, "ensemble.select_bases"),
+        measured=(_MEMBERS,),
+        note="Members were chosen one after the other among 17 estimates, each time "
+        "without the scene that is judged. `select_bases` decides by a frame's own "
+        "halves; ours.",
+    ),
+    Claim(
+        "section 5.3.2",
+        "relMSE in linear radiance, DSSIM after ACES and sRGB",
+        where=("metrics.rel_l2", "metrics.dssim", "metrics.tone_map"),
+        note="Relative L2 divides by the square of the channels' mean. Results here "
+        "are relative L2, and FLIP in experiments.comparison.tiers; no DSSIM.",
+    ),
+    Claim(
+        "fig. 12",
+        "at 4 samples `<M>` is too noisy, and the ensemble may fail",
+        where=("ensemble.error_matrix",),
+        measured=(_LEARNED,),
+        note="Multi-scale weights (`neural-ensemble`, without a network) tend to one "
+        "weight a base: over the better of path tracing and OIDN 0.971 at 4 "
+        "samples, 0.830 at 16; worst of all counts 1.02. The paper's weights at 4 "
+        "samples were not measured.",
+    ),
+    Claim(
+        "fig. 13",
+        "error curves of six scenes: ensembles are mostly below their bases",
+        where=(_TIERS,),
+        measured=(_TIERS,),
+        note="By tables. Over the best of its own members `balanced` has 0.846 (worst "
+        "1.11), `best` 0.791 (worst 1.17): rarely worse, not never.",
+    ),
+    Claim(
+        "fig. 14",
+        "scores by rank, averaged over scenes and samples, by relMSE and DSSIM",
+        where=(_WEIGHTS,),
+        note="All subsets of six bases, by relative L2 only. " + _NOT_YET,
+    ),
+    Claim(
+        "table 3",
+        "scores grow from 19.2 with two bases to 29.0 with five, and fall to 26.8 "
+        "with six",
+        where=(_WEIGHTS, _MEMBERS),
+        measured=(_MEMBERS,),
+        note="By error in place of scores, with multi-scale weights, over the better "
+        "of path tracing and OIDN: 1.04 with path tracing and OIDN, 0.517 with six "
+        "estimates, 0.409 with eleven. A member joins only if it lowers the error on "
+        "all scenes, so this cannot show a fall. Scores of subsets: "
+        "experiments.ensemble.weights, not measured yet.",
+    ),
+    Claim(
+        "section 5.3.4",
+        "unlike denoisers gain more together than like ones",
+        where=("experiments.oidn.variants", _MEMBERS),
+        measured=("experiments.oidn.variants", _MEMBERS),
+        note="Of one denoiser's variants and progressive denoising an ensemble has "
+        "0.597 of its error, with bilateral and RDFC 0.590 (worst 0.837 and 0.987): "
+        "variants gain much, other filters little more. Chosen without the scene, "
+        "non-local means and some combiners join in 11 of 11 choices, RDFC and NFOR in "
+        "none.",
+    ),
+    Claim(
+        "section 5.3.5, 5.3.6",
+        "recommended: KPCN, NFOR, OIDN and RDFC; fewer or others by samples",
+        where=("methods.TIERS",),
+        note="Not our sets: KPCN has no weights that come with the package. Ours "
+        "follow experiments.comparison.members, one for all sample counts.",
+    ),
+    Claim(
+        "fig. 15",
+        "close-ups of all bases and ensembles",
+        where=("experiments.comparison.page",),
+        note="The page shows such images, of our scenes; it is not kept here.",
+    ),
+)
+
+CLAIMS = EQUATIONS + FIGURES
+
+
+def run(options: Options) -> tuple[Claim, ...]:
+    """Return all claims.
+
+    Args:
+        options: of no effect.
+
+    Returns:
+        the claims.
+    """
+    del options
+    return CLAIMS
+
+
+if __name__ == "__main__":
+    main(Options, run, report)
