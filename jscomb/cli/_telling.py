@@ -50,10 +50,14 @@ class Teller:
         """
         self._voice, self._seconds, self._label = voice, {}, ""
         self._frame, self._several, self._start = "", count > 1, time.perf_counter()
-        shown: dict[str, Any] = {"total": count, "unit": "frame"}
-        if count == 1:
-            shown = {"bar_format": "{desc} {elapsed}"}
-        self._bar = tqdm(**shown, leave=False, disable=self._hidden)
+        several = (
+            "{n_fmt} of {total_fmt} frames done, {elapsed}, {remaining} left: {desc}"
+        )
+        shown = several if count > 1 else "{elapsed} {desc}"
+        self._bar = tqdm(
+            total=count, bar_format=shown, leave=False, disable=self._hidden
+        )
+        self._known: set[str] = set()
         self._ended = threading.Event()
 
     @property
@@ -96,8 +100,9 @@ class Teller:
         self._stop()
         self._label, self._start = label, time.perf_counter()
         shown = f"{self._frame}: {label}" if self._several else label
-        if label.startswith(_COMPILES):
-            shown += " (the first time it is compiled)"
+        if label.startswith(_COMPILES) and label not in self._known:
+            shown += " (compiled the first time)"
+        self._known.add(label)
         self._bar.set_description_str(shown)
 
     def _stop(self) -> None:
