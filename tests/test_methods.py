@@ -189,7 +189,10 @@ def test_a_perfect_image_is_kept_and_a_wrong_one_is_not(truth_is):
         variance=one * 0.01,
         estimates={"y": Estimate(y, jnp.stack([y, y]))},
     )
-    made = combine_tier(key(), frame, biased=["y", "path-tracing"])
+    told = []
+    names = ["y", "path-tracing"]
+    made = combine_tier(key(), frame, biased=names, progress=told.append)
+    assert told == ["making path-tracing", "combining 2 estimates"]
     wrong = float(jnp.mean(jnp.square(made.estimate.image - 1)))
     noisy = float(jnp.mean(jnp.square(frame.color - 1)))
     assert wrong < (0.01 if truth_is == "biased" else 1.01) * noisy

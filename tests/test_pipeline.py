@@ -427,7 +427,7 @@ def test_info_says_what_was_taken_for_what(jscomb, here):
 @pytest.mark.parametrize("seconds", [0.3, 6.0])
 def test_an_interrupted_command_ends_at_once(seconds, here):
     """While it is imported, and at work; nothing is left half written."""
-    large = {n: np.tile(plane, (20, 20)) for n, plane in pbrt().items()}
+    large = {n: np.tile(plane, (60, 60)) for n, plane in pbrt().items()}
     write(here / "f.exr", large, samplesPerPixel=SPP)
     command = [sys.executable, "-m", "jscomb", "combine", "f.exr", "-o", "o.exr"]
     command += ["--method", "bilateral"]

@@ -299,7 +299,7 @@ def test_the_command_resumes_and_writes_what_the_library_renders(
     )
     assert status == 0
     assert launched == rendering.plan_passes(settings)[3:]
-    assert "8x8, 4 samples a pixel in 2 sub-buffer(s)" in said
+    assert "8x8, 4 samples a pixel in 2 sub-buffers" in said
     assert list(tmp_path.iterdir()) == [out]
     frame = exr.read_frame(out)
     expected = rendering.render(SCENE, settings)
@@ -321,13 +321,17 @@ def test_the_command_denoises(jscomb, tmp_path, monkeypatch):
     status, said, _ = jscomb("render", SCENE, "--out", out, *OPTIONS)
     assert (status, ", oidn" in said) == (0, True)
     assert exr.read_frame(out).estimates["oidn"].halves.shape == (2, 8, 8, 3)
-    status, said, _ = jscomb("render", SCENE, "--out", out, *OPTIONS, "--no-denoise")
+    again = ("render", SCENE, "--out", out, *OPTIONS)
+    status, _, error = jscomb(*again)
+    assert (status, error) == (2, f"jscomb: {out} exists: --force replaces it\n")
+    again = (*again, "--force")
+    status, said, _ = jscomb(*again, "--no-denoise")
     assert (status, ", oidn" in said) == (0, False)
     assert not exr.read_frame(out).estimates
     nowhere = Needs(package=Package("nowhere", "oidn"))
     for module in (oidn, oidn._denoise):
         monkeypatch.setattr(module, "NEEDS", nowhere)
-    status, said, _ = jscomb("render", SCENE, "--out", out, *OPTIONS)
+    status, said, _ = jscomb(*again)
     assert status == 0
     assert (
         'oidn: skipped: needs the package nowhere: pip install "jscomb[oidn]"' in said

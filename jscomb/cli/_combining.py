@@ -1,7 +1,6 @@
 """`jscomb combine`: a frame, or a sequence of them, from file to file."""
 
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -10,20 +9,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 import jscomb
-from jscomb import exr, methods, metrics
+from jscomb import exr, methods
 from jscomb.cli import _tables as tables
 from jscomb.cli._frames import FEATURES, Job, Loaded, Options, Sources, load
+from jscomb.cli._making import Made, by_tier, made_of, remedy
 from jscomb.cli._matching import expand, is_several, match
 from jscomb.cli._outputs import (
+    Force,
     check_folder,
     check_inputs_stay,
     path_from,
     state,
     targets,
 )
+from jscomb.cli._telling import Teller, as_json, voice
 from jscomb.frame import Frame
 from jscomb.numerics.tiles import Local, stream_crops, tile_within
 from jscomb.typing import Image
@@ -39,7 +40,7 @@ _Feature = Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE|PATTERN")]
 _Method = Annotated[str, tyro.conf.arg(metavar="NAME")]
 _Budget = Annotated[float | None, tyro.conf.arg(metavar="SECONDS")]
 _Memory = Annotated[int, tyro.conf.arg(metavar="MIB")]
-_Force = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 AUTO = "auto"
 LARGE = 2**21  # pixels; larger frames are combined by crops
 MAX_MEMORY = exr.MAX_BYTES // 2**20
@@ -63,7 +64,10 @@ def combine(
     pixels: Literal["same", "half", "float"] = "same",
     memory: _Memory = 2048,
     max_memory: MaxMemory = MAX_MEMORY,
-    force: _Force = False,
+    force: Force = False,
+    quiet: _Flag = False,
+    verbose: _Flag = False,
+    json: _Flag = False,
 ) -> None:
     """Combine path-traced frames with biased images into better images.
 
@@ -111,7 +115,11 @@ def combine(
             combined by crops as large as that allows. A tier takes what it needs.
         max_memory: mebibytes that the pixels of one file may take in memory.
         force: replace files that are not results of the frame.
+        quiet: print errors only.
+        verbose: print what was read and the seconds of each step, too.
+        json: print one line of JSON a frame instead; null for what is not finite.
     """
+    speaking = voice(quiet=quiet, verbose=verbose, json=json)
     options = Options(method, budget, samples, layer, layers, pixels)
     limits = Limits(memory * 2**20, max_memory * 2**20, force)
     _check(options, limits)
@@ -126,10 +134,11 @@ def combine(
     for job in jobs:
         if not job.folder:
             check_folder(job.target)
-    if len(jobs) == 1:
-        _combine_job(jobs[0], options, limits)
-    else:
-        _combine_sequence(jobs, options, limits)
+    with Teller(speaking, len(jobs)) as teller:
+        if len(jobs) == 1:
+            _combine_job(jobs[0], options, limits, teller)
+        else:
+            _combine_sequence(jobs, options, limits, teller)
 
 
 class Limits(NamedTuple):
@@ -196,54 +205,87 @@ def _matched(
     return match(option, given, frames)
 
 
-def _combine_sequence(jobs: Sequence[Job], options: Options, limits: Limits) -> None:
+def _combine_sequence(
+    jobs: Sequence[Job], options: Options, limits: Limits, teller: Teller
+) -> None:
     """Combine every frame into the folder, and report those that fail."""
     failed = []
-    for job in tqdm(jobs, unit="frame", disable=None):
-        try:
-            _combine_job(job, options, limits)
-        except (ValueError, OSError, ImportError, RuntimeError) as error:
-            why = " ".join(str(error).split()).removeprefix(f"{job.frame}: ")
-            print(f"{job.frame}: {why}", file=sys.stderr)
-            failed.append(os.path.basename(os.path.abspath(job.frame)))
+    for job in jobs:
+        name = os.path.basename(os.path.abspath(job.frame))
+        with teller.frame(name):
+            try:
+                _combine_job(job, options, limits, teller)
+            except (ValueError, OSError, ImportError, RuntimeError) as error:
+                why = " ".join(str(error).split()).removeprefix(f"{job.frame}: ")
+                teller.fail(job.frame, job.target, why)
+                failed.append(name)
     if failed:
         raise ValueError(
             f"{len(failed)} of {len(jobs)} frames failed: {', '.join(failed)}"
         )
 
 
-def _combine_job(job: Job, options: Options, limits: Limits) -> None:
+def _combine_job(job: Job, options: Options, limits: Limits, teller: Teller) -> None:
     """Combine one frame, unless that is done already."""
     if job.wrong is not None:
         raise job.wrong
+    teller.begin("reading")
     sources = Sources(job)
     made_from = sources.made_from(options, jscomb.__version__)
     check_inputs_stay([job.target], sources.files())
     if state(job.target, job.frame, made_from, force=limits.force) == "done":
-        print(f"{job.target} is there already")
+        teller.say(f"{job.target} is there already")
+        teller.give(frame=job.frame, out=job.target, status="there already")
         return
     loaded = load(sources, options, limits.max_bytes)
-    for note in loaded.notes:
-        print(f"{job.frame}: {note}")
+    teller.say(*(f"{job.frame}: {note}" for note in loaded.notes))
+    teller.say_more(f"read {job.frame}: {tables.frame_of(loaded.contents)}")
+    teller.begin("combining")
     try:
-        made = _combined(loaded.frame, loaded.biased, options, limits.memory)
+        made = _combined(loaded.frame, loaded.biased, options, limits.memory, teller)
     except ValueError as error:
-        raise ValueError(f"{job.frame}: {error}{_remedy(loaded.frame)}") from None
-    if made.method != options.method and _lacks_noise(loaded.frame):
-        known = "it has neither variance nor half buffers, so it is denoised only"
-        print(f"{job.frame}: {known}{_remedy(loaded.frame)}")
+        raise ValueError(f"{job.frame}: {error}{remedy(loaded.frame)}") from None
     if job.folder:
         os.makedirs(job.folder, exist_ok=True)
-    _write(job, loaded, made, options, made_from)
+    jax.block_until_ready(made.image)
+    teller.begin("writing")
+    lost = _write(job, loaded, made, options, made_from)
+    _report(job, loaded, made, options, lost, teller)
+
+
+def _report(
+    job: Job,
+    loaded: Loaded,
+    made: Made,
+    options: Options,
+    lost: Sequence[str],
+    teller: Teller,
+) -> None:
+    """Say what was done and why, and the errors if there is a reference."""
+    frame, color = loaded.frame, loaded.contents.color
+    teller.say(*(f"{job.target}: {line}" for line in lost))
+    if made.by is not None:
+        teller.say(made.sentence(frame))
     of = f" of {', '.join(made.bases)}" if made.bases else ""
-    size = tables.size(loaded.frame)
-    color = loaded.contents.color
     where = f", as {color.shown}" if color and color.name and _keeps(options) else ""
-    print(f"wrote {job.target}: {size}, {made.method}{of}{where}")
-    if loaded.frame.reference is not None:
-        held = {n: estimate.image for n, estimate in loaded.frame.estimates.items()}
-        images = {"input": loaded.frame.color, **held, made.method: made.image}
-        tables.print_table({"relative L2": tables.errors(images, loaded.frame)})
+    size = tables.size(frame)
+    teller.say(f"wrote {job.target}: {size}, {made.method}{of}{where}")
+    errors, excluded = {}, ""
+    if frame.reference is not None:
+        held = {n: estimate.image for n, estimate in frame.estimates.items()}
+        images = {"input": frame.color, **held, made.method: made.image}
+        errors, excluded = tables.errors(images, frame)
+        table = tables.table({"relative L2": tables.rounded(errors)})
+        teller.say(*([excluded] if excluded else []), *table)
+    teller.say_seconds()
+    teller.give(
+        frame=job.frame,
+        out=job.target,
+        status="written",
+        **made.summary(frame),
+        errors={name: as_json(error) for name, error in errors.items()} or None,
+        notes=[*loaded.notes, *lost, *([excluded] if excluded else [])],
+    )
 
 
 def _keeps(options: Options) -> bool:
@@ -251,34 +293,10 @@ def _keeps(options: Options) -> bool:
     return options.layers == "all"
 
 
-def _lacks_noise(frame: Frame) -> bool:
-    """Whether nothing tells how noisy a frame is."""
-    return frame.buffers.variance is None and frame.sub_buffers < 2
-
-
-def _remedy(frame: Frame) -> str:
-    """What would make more possible; empty if nothing is missing."""
-    if not _lacks_noise(frame):
-        return ""
-    return (
-        "; a second render with another seed (--halves) or a variance (--variance) "
-        "lets it be combined better"
-    )
-
-
-class Made(NamedTuple):
-    """An image, by which method or tier, of which estimates, and its error."""
-
-    method: str
-    image: Image
-    bases: list[str]
-    error: metrics.ErrorEstimate | None = None
-
-
 def _write(
     job: Job, loaded: Loaded, made: Made, options: Options, made_from: dict[str, Any]
-) -> None:
-    """Write the result as the frame's file has it, and say what is lost."""
+) -> list[str]:
+    """Write the result as the frame's file has it; what is lost, in lines."""
     contents, frame = loaded.contents, loaded.frame
     provenance = {
         "jscomb": jscomb.__version__,
@@ -289,14 +307,15 @@ def _write(
         "made from": made_from,
         "input": contents.provenance,
     }
-    error = None if made.error is None else np.asarray(made.error.map)
-    if made.error is not None:
-        provenance["estimated relative L2"] = [float(i) for i in made.error[1:]]
+    found = None if made.by is None else made.by.error
+    error = None if found is None else np.asarray(found.map)
+    if found is not None:
+        provenance["estimated relative L2"] = [float(i) for i in found[1:]]
     image, color = np.asarray(made.image), np.asarray(frame.color)
     image = np.where(np.isfinite(image), image, color)  # unknown: it stays as it is
     image = np.where(contents.empty, 0, image)
     error = None if error is None else np.where(contents.empty, 0, error)
-    lost = exr.write_contents(
+    return exr.write_contents(
         job.target,
         contents,
         image,
@@ -305,54 +324,25 @@ def _write(
         pixels=options.pixels,
         provenance=provenance,
     )
-    for line in lost:
-        print(f"{job.target}: {line}")
 
 
-def _combined(frame: Frame, name: str | None, options: Options, memory: int) -> Made:
+def _combined(
+    frame: Frame, name: str | None, options: Options, memory: int, teller: Teller
+) -> Made:
     """Combine a frame by a tier or a method."""
     key, method = jax.random.key(0), options.method
     if method == AUTO or method in methods.TIERS:
-        return by_tier(frame, None if method == AUTO else method, name, options.budget)
+        tier = None if method == AUTO else method
+        return by_tier(frame, tier, name, options.budget, progress=teller.begin)
+    teller.begin(f"combining by {method}")
     if methods.METHODS[method].takes == "nothing":
         name = None
     local = methods.plan(key, frame, method=method, biased=name)
-    image = _evaluated(local, memory)
-    return Made(method, image, _made_of(frame, name, method))
+    image = _evaluated(local, memory, teller)
+    return Made(method, image, made_of(frame, name, method))
 
 
-def by_tier(
-    frame: Frame,
-    tier: str | None,
-    name: str | None = None,
-    budget: float | None = None,
-) -> Made:
-    """Combine a frame by a tier, and print what it is made of and its error."""
-    made = methods.combine_tier(
-        jax.random.key(0), frame, tier=tier, biased=name, budget=budget
-    )
-    if made.reason and not _lacks_noise(frame):
-        print(made.reason)
-    for skipped, reason in made.skipped.items():
-        print(f"{skipped}: skipped: {reason}")
-    if made.error is not None:
-        _, mean, deviation = made.error
-        count = f"ensemble of {len(made.bases)} estimates"
-        print(f"{count}: estimated relative L2 {mean:.2g} ± {deviation:.1g}")
-    return Made(made.tier, made.estimate.image, list(made.bases), made.error)
-
-
-def _made_of(frame: Frame, name: str | None, method: str) -> list[str]:
-    """The names of the estimates that a method combines."""
-    chosen = methods.METHODS[method]
-    if chosen.takes == "estimates":
-        return list(methods.inputs(frame.normalised(), biased=name, method=method)[0])
-    if chosen.takes == "nothing":
-        return [chosen.denoiser] if chosen.denoiser else []
-    return [methods.input_name(frame, biased=name)]
-
-
-def _evaluated(local: Local, memory: int) -> Image:
+def _evaluated(local: Local, memory: int, teller: Teller) -> Image:
     """The image of a local function; a large one by crops that keep to the memory."""
     first = jax.tree.leaves(local.images)[0]
     height, width = first.shape[:2]
@@ -362,6 +352,6 @@ def _evaluated(local: Local, memory: int) -> Image:
     image = np.empty((height, width, 3), np.float32)
     parts = stream_crops(**local._asdict(), tile=tile)
     count = -(-height // tile) * -(-width // tile)
-    for where, part in tqdm(parts, total=count, unit="crop", disable=None):
+    for where, part in teller.each(parts, count, "crop"):
         image[where] = part
     return jnp.asarray(image)

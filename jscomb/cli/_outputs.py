@@ -3,11 +3,14 @@
 import json
 import os
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from jscomb import exr
 
 SUFFIX = ".exr"
+Force = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 def targets(frames: Sequence[str], out: str) -> list[str]:
@@ -82,6 +85,17 @@ def check_folder(target: str) -> None:
     folder = os.path.dirname(os.path.realpath(target))
     if not os.path.isdir(folder):
         raise FileNotFoundError(f"{target}: the folder {folder} does not exist")
+
+
+def check_is_new(target: str, *, force: bool) -> None:
+    """Raise if a file is there that must not be replaced.
+
+    Args:
+        target: file to write.
+        force: replace it.
+    """
+    if os.path.isfile(target) and not force:
+        raise ValueError(f"{target} exists: --force replaces it")
 
 
 def state(

@@ -1,5 +1,6 @@
 """`jscomb render`: a scene to a frame's file."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +9,7 @@ import tyro
 
 from jscomb import exr, methods, rendering
 from jscomb.cli import _tables as tables
+from jscomb.cli._outputs import Force, check_inputs_stay, check_is_new
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
 
@@ -25,6 +27,7 @@ def render(
     settings: _Settings = _DEFAULT,
     reference_from: _File = None,
     denoise: bool = True,
+    force: Force = False,
 ) -> None:
     """Render a frame with everything that a combiner may ask for, by Mitsuba 3.
 
@@ -40,7 +43,11 @@ def render(
         settings: what is rendered.
         reference_from: frame file of the scene whose reference to take.
         denoise: add the image by Open Image Denoise, where that is installed.
+        force: replace a file that is there.
     """
+    check_is_new(os.fspath(out), force=force)
+    if reference_from is not None:
+        check_inputs_stay([os.fspath(out)], [os.fspath(reference_from)])
     frame = render_file(
         scene, out, settings, reference_from=reference_from, denoise=denoise
     )
@@ -48,8 +55,8 @@ def render(
         print(f"oidn: skipped: needs {oidn.NEEDS.missing_package()}")
     also = [*frame.estimates, *(["reference"] if frame.reference else [])]
     print(
-        f"wrote {out}: {tables.size(frame)}, {tables.samples(frame)} samples a pixel "
-        f"in {frame.sub_buffers} sub-buffer(s){''.join(f', {name}' for name in also)}"
+        f"wrote {out}: {tables.size(frame)}, {tables.samples(frame)}"
+        f"{''.join(f', {name}' for name in also)}"
     )
 
 

@@ -18,8 +18,8 @@ from jscomb.cli._combining import (
     LayerName,
     MaxMemory,
     SampleCount,
-    by_tier,
 )
+from jscomb.cli._making import by_tier
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
 from jscomb.typing import Image
@@ -46,21 +46,26 @@ def demo(*, out: Path = _DEMO_FOLDER) -> None:
     by_samples = sorted(frames.items(), key=lambda item: float(item[1].samples or 0))
     table, shown, ms = {}, [], {}
     for name, frame in by_samples:
-        spp = f"{tables.samples(frame)} spp"
+        spp = f"{float(frame.samples or 0):g} spp"
         print(f"{spp}:")
         combined, ms = _all_methods(frame)
         for tier in TIERS:
             start = time.perf_counter()  # of the second frame without compilation
-            combined[tier] = jax.block_until_ready(by_tier(frame, tier).image)
+            made = by_tier(frame, tier)
+            combined[tier] = jax.block_until_ready(made.image)
             ms[tier] = f"{1e3 * (time.perf_counter() - start):.0f}"
+            print(made.sentence(frame))
         for method, image in combined.items():
             exr.write_image(out / f"{name}-{method}.exr", image)
         images = {"path tracing": frame.color, **combined}
-        table[spp] = tables.errors(images, frame)
+        errors, excluded = tables.errors(images, frame)
+        table[spp] = tables.rounded(errors)
+        if excluded:
+            print(excluded)
         shown.append((frame, {TIERS[-1]: combined[TIERS[-1]]}))
     size = tables.size(by_samples[0][1])
     print(f"relative L2 of one scene, {size}, and the time of each step")
-    tables.print_table({**table, "ms": ms})
+    print(*tables.table({**table, "ms": ms}), sep="\n")
     print("denoised is the image by Open Image Denoise, and its time.")
     picture = out / "comparison.png"
     plots.comparison(picture, shown)
@@ -103,12 +108,16 @@ def info(
     if contents.missing:
         print(f"  no variance     {contents.missing}")
     if contents.frame is not None:
-        _print_frame(contents.frame, contents.median_luminance)
+        _print_frame(contents)
     else:
         _print_range("denoised alone", contents.image)
     for name, value in contents.provenance.items():
         if name != "made from":
-            print(f"  made with       {name} = {value}")
+            print(f"  made with       {_MADE_WITH.get(name, name)} = {value}")
+
+
+# Of a render; its file may hold it merged into fewer sub-buffers.
+_MADE_WITH = {"spp": "samples a pixel", "buffers": "sub-buffers rendered"}
 
 
 def _print_file(contents: exr.Contents) -> None:
@@ -138,14 +147,17 @@ def _print_file(contents: exr.Contents) -> None:
 _NAMED = ("layer", "albedo", "normal", "variance")  # options
 
 
-def _print_frame(frame: Frame, luminance: float) -> None:
+def _print_frame(contents: exr.Contents) -> None:
     """Size, samples, and the range of every buffer."""
+    frame = contents.frame
+    assert frame is not None
     count = frame.sub_buffers
     print(f"  size            {tables.size(frame)}")
-    spp = tables.samples(frame)
-    print(f"  samples         {spp} a pixel in {count} sub-buffer(s)")
+    rendered = contents.provenance.get("buffers", count)
+    merged = f", rendered in {rendered} and merged" if rendered != count else ""
+    print(f"  samples         {tables.samples(frame)}{merged}")
     print(f"  invalid pixels  {int((~frame.valid).sum())}")
-    print(f"  median luminance {luminance:.4g}")
+    print(f"  median luminance {contents.median_luminance:.4g}")
     if frame.buffers.variance is None and count < 2:
         print("  noise           unknown: neither variance nor half buffers (--halves)")
     stored: dict[str, Any] = {

@@ -1,8 +1,9 @@
 """What a method is given of a frame: its estimates, made where they are missing."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jscomb.denoisers import oidn
@@ -174,13 +175,21 @@ def with_input(key: Key, frame: Frame, name: str) -> Frame:
     return frame.with_estimate(name, method.estimate(key, frame, *given))
 
 
-def with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
+def with_inputs(
+    key: Key,
+    frame: Frame,
+    names: Sequence[str],
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> Frame:
     """Return the frame with estimates, made if they are not there.
 
     Args:
         key: of random probes, a typed key.
         frame: normalised.
         names: of the frame's estimates, or of methods.
+        progress: called with what is about to be made ("making pd"), once all before is
+            computed; None to compute without waiting.
 
     Returns:
         the frame with all of them; those of one kind are made together.
@@ -198,12 +207,22 @@ def with_inputs(key: Key, frame: Frame, names: Sequence[str]) -> Frame:
     made = {n: METHODS[n].variant for n in names if n not in frame.estimates}
     variants = {n: variant for n, variant in made.items() if variant is not None}
     if variants:
+        tell(progress, f"making {', '.join(variants)}", frame)
         estimates = oidn.denoise_variants(frame, list(variants.values()))
         for name, estimate in zip(variants, estimates, strict=True):
             frame = frame.with_estimate(name, estimate)
     for name in names:
+        if name not in frame.estimates:
+            tell(progress, f"making {name}", frame)
         frame = with_input(key, frame, name)
     return frame
+
+
+def tell(progress: Callable[[str], None] | None, what: str, before: Any) -> None:
+    """Call with what is about to be made, when all arrays before it are computed."""
+    if progress is not None:
+        jax.block_until_ready(before)
+        progress(what)
 
 
 def can_make(name: str, frame: Frame) -> bool:

@@ -1,7 +1,7 @@
 """The default method, in three tiers of cost: as many estimates as a budget allows."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jscomb import ensemble, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame
-from jscomb.methods._inputs import given_to, inputs, with_inputs
+from jscomb.methods._inputs import given_to, inputs, tell, with_inputs
 from jscomb.methods._table import FEW, METHODS
 from jscomb.numerics.tiles import compiled
 from jscomb.typing import Key
@@ -73,6 +73,7 @@ def combine_tier(
     tier: str | None = None,
     biased: str | Sequence[str] | None = None,
     budget: float | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Combined:
     """Combine a frame by the default method, and estimate the result's error.
 
@@ -88,6 +89,8 @@ def combine_tier(
             one name alone is combined with the noisy image.
         budget: seconds, without compilation; decides by the time of denoising a part of
             the frame. None for any.
+        progress: called with what is about to be made ("making pd", "combining 10
+            estimates"), once all before is computed; None to compute without waiting.
 
     Returns:
         the estimate, its error, and what it is made of.
@@ -113,13 +116,13 @@ def combine_tier(
         wanted = [wanted, "path-tracing"] if isinstance(wanted, str) else wanted
         names, skipped = inputs(whole, biased=wanted)
         if whole.sub_buffers > 1 and set(names) - {"path-tracing"}:
-            made = _ensemble(key, whole, names)
+            made = _ensemble(key, whole, names, progress)
             made = made._replace(tier=tier, skipped=skipped, reason=reason)
             return _scaled(made, frame, whole)
         reason = f"{tier}: no estimate has halves"
         if whole.sub_buffers < 2:
             reason = f"{tier} needs half buffers, to weigh its estimates by"
-    made = _single(key, whole, biased)
+    made = _single(key, whole, biased, progress)
     return _scaled(made._replace(reason=made.reason or reason), frame, whole)
 
 
@@ -154,9 +157,15 @@ def _seconds(frame: Frame) -> float:
     return min(times) * height * width / small.color[..., 0].size
 
 
-def _ensemble(key: Key, frame: Frame, names: Sequence[str]) -> Combined:
+def _ensemble(
+    key: Key,
+    frame: Frame,
+    names: Sequence[str],
+    progress: Callable[[str], None] | None,
+) -> Combined:
     """Of estimates by name, with weights that both halves share."""
-    frame = with_inputs(key, frame, names)
+    frame = with_inputs(key, frame, names, progress=progress)
+    tell(progress, f"combining {len(names)} estimates", frame)
     estimates = {name: frame.estimates[name] for name in names}
     weights = ensemble.weigh_frame(frame, estimates)
     bases = ensemble.stack_estimates(estimates)
@@ -168,7 +177,12 @@ def _ensemble(key: Key, frame: Frame, names: Sequence[str]) -> Combined:
     return Combined(made, "", tuple(names), {}, "", error)
 
 
-def _single(key: Key, frame: Frame, biased: str | Sequence[str] | None) -> Combined:
+def _single(
+    key: Key,
+    frame: Frame,
+    biased: str | Sequence[str] | None,
+    progress: Callable[[str], None] | None,
+) -> Combined:
     """Of one denoised image of the frame as a whole, since halves would cost twice."""
     names = [biased] if isinstance(biased, str) else list(biased or frame.estimates)
     name = "oidn" if not names or "oidn" in names else names[0]
@@ -178,7 +192,10 @@ def _single(key: Key, frame: Frame, biased: str | Sequence[str] | None) -> Combi
         alone = alone._replace(buffers=buffers)
     missing = METHODS["multi-scale"].needs.missing(alone)
     method, tier = ("denoised", "denoised") if missing else ("multi-scale", "fast")
+    if name not in alone.estimates:
+        tell(progress, f"making {name}", alone)
     alone, given = given_to(key, alone, method, name)
+    tell(progress, f"combining by {method}", alone)
     image = METHODS[method].image(key, alone, *given)
     reason = f"fast needs {missing}" if missing else ""
     return Combined(Estimate(image), tier, (name,), {}, reason, None)
