@@ -5,9 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jscomb import combine, exr, james_stein, methods, metrics, uncorrelated
+from jscomb import (
+    combine,
+    ensemble,
+    exr,
+    james_stein,
+    methods,
+    metrics,
+    uncorrelated,
+)
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Needs, make_frame
+from jscomb.learning import recipes
 from jscomb.methods import BASES, METHODS, TIERS, Method, combine_tier
 from jscomb.numerics.tiles import Local
 from tests.battery import catalogue
@@ -43,11 +52,12 @@ def small(glass_frame):
 
 
 # Of any frame: what takes a second rendering has a test of its own.
+SHARING = "neural-ensemble"  # combiners among its bases have no halves of halves
 ALONE = [name for name, method in METHODS.items() if method.input is None]
 
 
 @needs_oidn
-@pytest.mark.parametrize("name", slow_ones(ALONE))
+@pytest.mark.parametrize("name", slow_ones(n for n in ALONE if n != SHARING))
 def test_every_method_makes_an_estimate(name, small):
     """Finite, and each half is what the method makes of that half alone."""
     frame = small
@@ -65,6 +75,22 @@ def test_every_method_makes_an_estimate(name, small):
             alone = alone.with_estimate("oidn", fresh)
         expected = combine(key(), alone, method=name).image * unit
         np.testing.assert_allclose(own, expected, rtol=2e-4, atol=1e-5 * unit)
+
+
+@needs_oidn
+@pytest.mark.slow
+def test_an_ensemble_of_combiners_gives_both_halves_the_same_weights(small):
+    made = combine(key(), small, method=SHARING)
+    names = METHODS[SHARING].bases
+    whole = methods.with_inputs(key(), small.normalised(), names)
+    estimates = {name: whole.estimates[name] for name in names}
+    network = recipes.shipped(SHARING)
+    weights = ensemble.plan_neural_weights(network, whole, estimates).whole()
+    assert weights.min(axis=(0, 1)).max() > 0
+    for number in range(2):
+        halves = np.stack([e.halves[number] for e in estimates.values()], axis=2)
+        expected = np.sum(weights[..., None] * halves, axis=2) * whole.unit
+        np.testing.assert_allclose(made.halves[number], expected, rtol=1e-4, atol=1e-7)
 
 
 @needs_oidn
