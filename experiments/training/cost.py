@@ -174,7 +174,7 @@ def report(costs: dict[str, Cost]) -> Report:
         )
 
     kinds = dict.fromkeys(name.rpartition(" ")[2] for name in rows)
-    answer = f"{'; '.join(map(span, kinds))}.".capitalize()
+    answer = f"Networks, {'; '.join(map(span, kinds))}."
     header = "network", "s a megapixel", "kFLOP a pixel", "share", "MB a megapixel"
     cells = [
         [name, cost.seconds, cost.operations / 1e3, cost.share, cost.memory]
