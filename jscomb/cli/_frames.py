@@ -216,8 +216,8 @@ def _with_halves(
         colors.append(color)
     if len(frames) % 2:
         raise ValueError(
-            f"--halves: needs an even number of renders with the frame, has "
-            f"{len(frames)}"
+            f"--halves: needs an even number of renders, the frame among them, has "
+            f"{len(frames)}: add one with another seed"
         )
     if not takes_part and own not in paths:
         _check_mean(job.frame, frame.color, colors)

@@ -36,7 +36,7 @@ FEATURES = {
     ),
     "depth": (
         *("denoisingdepth", "denoisedepth", "depth", "z", "zdepth", "vrayzdepth"),
-        *("zfiltered", "depthz", "zbuffer", "distance"),
+        *("zfiltered", "depthz", "zbuffer", "distance", "hitpz"),
     ),
     "visibility": ("visibility",),
 }
