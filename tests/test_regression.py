@@ -147,16 +147,32 @@ def test_two_targets_share_one_model(rng):
     )
 
     def joint(a, ga, ha, b, gb, hb, features):
-        return joint_local_linear(
+        (fit,) = joint_local_linear(
             [(a, gaussian_weights(ga, ha)), (b, gaussian_weights(gb, hb))],
             features,
             predict=gaussian_weights(ga, 0.2),
             window=9,
         )
+        return fit
 
     found = jax.jit(joint)(*map(jnp.asarray, (a, ga, ha, b, gb, hb, features)))
     assert errors(found, expected).max() < 1e-10
     np.testing.assert_allclose(found.weight[..., 0], expected[1], rtol=1e-10)
+
+
+def test_powers_are_bandwidths(rng):
+    t, g, features = images(rng, 14, 18, 3)
+    powers = (4, 1, 2.5)
+
+    @jax.jit
+    def fits(t, g, features):
+        weighted = [(t, gaussian_weights(g, 0.4))]
+        return joint_local_linear(weighted, features, powers=powers, window=9)
+
+    for power, found in zip(powers, fits(t, g, features), strict=True):
+        expected = oracle([(t, gaussian(g, 0.4 / power))], features, window=9)
+        assert errors(found, expected).max() < 1e-10
+        np.testing.assert_allclose(found.weight[..., 0], expected[1], rtol=1e-10)
 
 
 def hard_cases():

@@ -40,7 +40,7 @@ from jscomb.numerics.guards import (
 from jscomb.numerics.regression import joint_local_linear
 from jscomb.numerics.tiles import compiled
 from jscomb.numerics.windows import window_mean, window_sum
-from jscomb.typing import Image, Scalar, Variance
+from jscomb.typing import Image, Variance
 
 __all__ = ["NEEDS", "denoise", "denoise_frame", "filter_features"]
 
@@ -71,8 +71,8 @@ def denoise(
 ) -> tuple[Image, Image]:
     """Denoise both halves, each with the other's weights and features.
 
-    Pure, differentiable in every array, and scale-equivariant. Costs four calls of
-    `local_linear` with small windows.
+    Pure, differentiable in every array, and scale-equivariant. The weights of both
+    strengths are computed once, and take half of the time.
 
     Args:
         unbiased_a: x_a, radiance, shape [H,W,C].
@@ -116,20 +116,21 @@ def denoise(
     )
 
     def fit(half: tuple[Image, Image, Variance, Features]) -> Pair:
-        """One half with either strength."""
+        """One half with either strength: weights of one are powers of the other's."""
         x, guide, v, f = half
         noise = window_mean(v, _POOL, mask=finite(v))
-
-        def one(strength: Scalar) -> Image:
-            weights = nonlocal_means.weights(
-                guide, noise, patch=patch, strength=strength
-            )
-            prediction, weight = joint_local_linear(
-                [(x, weights)], f, window=window, stride=stride, ridge=ridge
-            )
-            return jnp.where(weight > 0, prediction, first_finite(x, guide))
-
-        return lax.map(one, jnp.asarray(strengths, x.dtype))
+        widest = max(strengths)
+        weights = nonlocal_means.weights(guide, noise, patch=patch, strength=widest)
+        fits = joint_local_linear(
+            [(x, weights)],
+            f,
+            powers=[(widest / strength) ** 2 for strength in strengths],
+            window=window,
+            stride=stride,
+            ridge=ridge,
+        )
+        otherwise = first_finite(x, guide)
+        return jnp.stack([jnp.where(w > 0, t, otherwise) for t, w in fits])
 
     if not min(strengths) > 0:
         raise ValueError(f"strengths must be positive, got {strengths}")

@@ -69,7 +69,7 @@ def radiance_prior(
     # A bandwidth is the mean of both pixels' values: twice for their sum.
     of_unbiased = gaussian_weights(unbiased, 2 * variance + epsilon)
     of_biased = gaussian_weights(biased, 2 * mse + epsilon)
-    fit = joint_local_linear(
+    (fit,) = joint_local_linear(
         [(unbiased, of_biased), (biased, of_unbiased)],
         features,
         predict=noise_free_weights(biased, mse, epsilon=epsilon),
@@ -119,7 +119,7 @@ def blend_prior(
 
     Source: ours, after DSC eq. 11-17.
     """
-    fit = joint_local_linear(
+    (fit,) = joint_local_linear(
         [(blend, gaussian_weights(blend, 2 * error + epsilon))],
         features,
         predict=noise_free_weights(blend, error, epsilon=epsilon),

@@ -120,7 +120,7 @@ def local_linear(
     Source: NJS eq. 10-12, without their ridge on the constant.
     """
     weighted = target, gaussian_weights(guide, bandwidth)
-    return joint_local_linear(
+    (fit,) = joint_local_linear(
         [weighted],
         features,
         window=window,
@@ -128,6 +128,7 @@ def local_linear(
         ridge=ridge,
         scale_floor=scale_floor,
     )
+    return fit
 
 
 def joint_local_linear(
@@ -135,27 +136,31 @@ def joint_local_linear(
     features: Float[Array, "h w f"],
     *,
     predict: Weights | None = None,
+    powers: Sequence[int | float] = (1,),
     window: int = 51,
     stride: int = 1,
     ridge: Float[Array, " f"] | float = 0.1,
     scale_floor: float = 0.1,
-) -> LocalFit:
+) -> tuple[LocalFit, ...]:
     """Fit one linear model to several targets, each with its own weights.
 
     Minimises the sum of their squared errors, whose normal equations are the sum of
-    theirs.
+    theirs. The fits for all powers of the weights take little longer than one where the
+    weights are what takes long.
 
     Args:
         targets: images [H,W,C] of one unit, with their weights.
         features: f, shape [H,W,F].
         predict: weights for the mean of the predictions; None for the first target's.
+        powers: that all weights are raised to, > 0, for a fit each; for exponential
+            weights their bandwidth is divided by it.
         window: width in pixels, odd.
         stride: pixels between the centres of windows.
         ridge: > 0, of the scaled features: one number, or one a feature, shape [F].
         scale_floor: > 0, unit of the features.
 
     Returns:
-        the predictions and their weights.
+        the predictions and their weights, for each power.
 
     Raises:
         ValueError: while tracing, as `local_linear`.
@@ -164,7 +169,7 @@ def joint_local_linear(
         >>> depth = jnp.arange(12.0).reshape(3, 4, 1)
         >>> even = gaussian_weights(0 * depth, 1.0)
         >>> both = [(3 * depth, even), (3 * depth + 2, even)]
-        >>> fit = joint_local_linear(both, depth, window=3, ridge=1e-6)
+        >>> (fit,) = joint_local_linear(both, depth, window=3, ridge=1e-6)
         >>> print(jnp.abs(fit.prediction - (3 * depth + 1)).max().round(3))
         0.0
 
@@ -190,20 +195,30 @@ def joint_local_linear(
             jnp.where(inside, tile_weights(s, plane, grid), 0.0)
             for s, plane in zip(similarity, planes[count:], strict=True)
         ]
-        moments = [
-            jnp.einsum("pn,mn->pm", _products(basis, flat(t)), w, precision="highest")
-            for t, w in zip(planes[:count], weights, strict=False)
-        ]
-        # An invalid centre without moments predicts 0, and its rounding has no
-        # derivative.
-        moment = jnp.where(centred[None], sum(moments[1:], moments[0]), 0.0)
-        b = _coefficients(moment, scale, ridges)
-        b = jnp.concatenate([b, centred[None].astype(b.dtype)])
-        w = weights[0 if predict is None else -1]
-        spread = jnp.einsum("pm,mn->pn", b, w, precision="highest")
-        terms = jnp.split(spread[:-1], len(basis))
-        predicted = sum(term * f[None] for term, f in zip(terms, basis, strict=True))
-        return jnp.concatenate([predicted, spread[-1:]]).reshape(-1, *size)
+        products = [_products(basis, flat(target)) for target in planes[:count]]
+
+        def one(power: int | float) -> Float[Array, "_ n"]:
+            # An integer power is products, any other takes logarithms.
+            exponent = int(power) if power == int(power) else power
+            raised = [w**exponent for w in weights]
+            moments = [
+                jnp.einsum("pn,mn->pm", product, w, precision="highest")
+                for product, w in zip(products, raised, strict=False)
+            ]
+            # An invalid centre without moments predicts 0, and its rounding has no
+            # derivative.
+            moment = jnp.where(centred[None], sum(moments[1:], moments[0]), 0.0)
+            b = _coefficients(moment, scale, ridges)
+            b = jnp.concatenate([b, centred[None].astype(b.dtype)])
+            w = raised[0 if predict is None else -1]
+            spread = jnp.einsum("pm,mn->pn", b, w, precision="highest")
+            terms = jnp.split(spread[:-1], len(basis))
+            predicted = sum(
+                term * f[None] for term, f in zip(terms, basis, strict=True)
+            )
+            return jnp.concatenate([predicted, spread[-1:]])
+
+        return jnp.concatenate([one(p) for p in powers]).reshape(-1, *size)
 
     region = lambda image, reach: Region(jnp.moveaxis(image, -1, 0), reach)
     basis = jnp.concatenate([valid.astype(clean.dtype), clean], -1)
@@ -215,6 +230,11 @@ def joint_local_linear(
         *(region(i, grid.reach + h) for i, h in zip(images, halos, strict=True)),
     ]
     sums = jnp.moveaxis(sum_over_tiles(fit, regions, grid), 0, -1)
+    return tuple(_mean(each, valid) for each in jnp.split(sums, len(powers), axis=-1))
+
+
+def _mean(sums: Image, valid: Mask) -> LocalFit:
+    """Divide the sum of weighted predictions by that of the weights, its last plane."""
     total, weight = sums[..., :-1], sums[..., -1:]
     # A subnormal weight has lost digits, and is 0 on some devices.
     normal = valid & (weight > float(jnp.finfo(weight.dtype).tiny))

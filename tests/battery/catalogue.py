@@ -419,7 +419,7 @@ def solvers(*, window: int | None = None) -> dict[str, Entry]:
     def jointly(r: Rendering) -> Image:
         weights = noise_free_weights(r.biased, r.grey, epsilon=0.01)
         targets = [(r.unbiased_a, weights), (r.unbiased_b, weights)]
-        prediction, weight = regression.joint_local_linear(
+        ((prediction, weight),) = regression.joint_local_linear(
             targets, r.features, window=wide
         )
         return jnp.where(weight > 0, prediction, 0.0)
