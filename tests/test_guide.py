@@ -167,6 +167,35 @@ def test_command_runs(words, jscomb, reader):
     assert out
 
 
+def test_every_frame_has_one_task_of_the_job_array(tmp_path):
+    """The script as it stands, with the command in place of what prints its words."""
+    ((_, script),) = blocks(ROOT / "jscomb" / "guide" / "large_frames.md", "bash")
+    command = tmp_path / "jscomb"
+    command.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    command.chmod(0o755)
+    (tmp_path / "frames").mkdir()
+    frames = [f"frames/{number:03} a.exr" for number in range(5)]
+    for frame in frames:
+        (tmp_path / frame).touch()
+    done = []
+    for task in range(7):  # more of them than frames
+        words = subprocess.run(
+            ["bash", "-c", script],
+            cwd=tmp_path,
+            env={
+                "PATH": f"{tmp_path}:{os.environ['PATH']}",
+                "SLURM_ARRAY_TASK_ID": str(task),
+                "SLURM_ARRAY_TASK_COUNT": "7",
+            },
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.splitlines()
+        assert not words or (words[0], words[-2:]) == ("combine", ["-o", "out/"])
+        done += words[1:-2]
+    assert sorted(done) == frames
+
+
 @pytest.mark.slow
 def test_the_table_is_what_the_demo_prints(jscomb, tmp_path):
     """The errors, but for rounding; times are a machine's own.

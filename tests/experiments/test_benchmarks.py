@@ -1,13 +1,21 @@
 """What functions cost: their work is counted right, and what was measured is kept."""
 
 import collections
+import pathlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.benchmarks import files, large, performance, robustness, tiers
+from experiments.benchmarks import (
+    files,
+    large,
+    performance,
+    processes,
+    robustness,
+    tiers,
+)
 from experiments.benchmarks.work import Work, work_of
 from jscomb import exr
 from tests.conftest import DATA
@@ -121,3 +129,21 @@ def test_tiers_cost_what_their_parts_do():
     assert parts[96].keys() >= {"oidn", "weights"}
     said = tiers.report((found, parts))
     assert f"fast {cost.second / cost.denoising:.3g}" in said.answer
+
+
+@pytest.mark.slow
+def test_processes_share_a_sequence():
+    frame = DATA / "cornell-glass-64.exr"
+    one, two = processes.run(processes.Config(frame, quick=True))
+    assert (one.processes, two.processes) == (1, 2)
+    assert one.frames == two.frames == 2
+    said = processes.report([one, two])
+    gain = one.seconds / two.seconds
+    assert f"2 processes {gain:.2f} times" in said.answer
+
+
+def test_every_frame_is_in_one_share():
+    frames = [*map(pathlib.Path, "abcdefg")]
+    found = processes.shares(frames, 3)
+    assert sorted(frame for share in found for frame in share) == frames
+    assert max(map(len, found)) - min(map(len, found)) == 1
