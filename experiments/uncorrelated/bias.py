@@ -50,6 +50,7 @@ class Config(Options):
         samples: samples a pixel of one sub-average, each in turn.
         size: width and height in pixels.
         window: width of the windows of methods with kernels.
+        frames: which of the synthetic and rendered ones.
     """
 
     work: tyro.conf.Positional[pathlib.Path]
@@ -58,14 +59,18 @@ class Config(Options):
     samples: tuple[int, ...] = (4, 16)
     size: int = 96
     window: int = 15
+    frames: tuple[str, ...] = (*SYNTHETIC, *RENDERED)
 
     def __post_init__(self) -> None:
-        """Groups are compared with each other."""
+        """Groups are compared with each other; frames have known names."""
         if self.groups < 3 or self.of_each < 2:
             raise ValueError(
                 "there must be at least 3 groups of 2 realisations, got "
                 f"{self.groups} of {self.of_each}"
             )
+        if unknown := {*self.frames} - {*SYNTHETIC, *RENDERED}:
+            known = ", ".join([*map(repr, SYNTHETIC), *map(repr, RENDERED)])
+            raise ValueError(f"no frame {min(unknown)!r}; there are {known}")
 
 
 class Summary(NamedTuple):
@@ -183,13 +188,13 @@ def run(config: Config) -> Found:
         ValueError: if there is no LLVM for common random numbers.
     """
     config.work.mkdir(parents=True, exist_ok=True)
-    names = [*SYNTHETIC, *RENDERED]
+    names = config.frames
     plan = Plan(
         config.work, config.groups, config.of_each, 0, config.size, config.window
     )
     if config.quick:
         plan = plan._replace(groups=3, of_each=4, size=24, window=5)
-        names = [names[1], names[2]]
+        names = names[1:3]
     return {
         name: {
             n: measure(kept(plan._replace(samples=n), name))

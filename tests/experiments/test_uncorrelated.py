@@ -132,6 +132,8 @@ def test_bias_of_all_methods(tmp_path, vectorised):
     assert list(said.figures) == ["Maps of the bias"]
     with pytest.raises(ValueError, match="at least 3 groups of 2 realisations"):
         bias.Config(tmp_path, groups=2)
+    with pytest.raises(ValueError, match="no frame 'box'; there are 'synthetic, sym"):
+        bias.Config(tmp_path, frames=("box",))
 
 
 def test_likeness_of_neighbours(vectorised):
