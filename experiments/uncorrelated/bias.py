@@ -218,7 +218,7 @@ def measure(groups: list[Group]) -> Measured:
 
 def maps(found: dict[str, Measured]) -> Figure:
     """Maps of the bias: a row for each frame, a column for each method."""
-    size = 2 * len(METHODS), 2.3 * len(found)
+    size = 1.4 * len(METHODS), 1.75 * len(found)
     figure = Figure(figsize=size, layout="compressed")
     axes = figure.subplots(len(found), len(METHODS), squeeze=False)
     for row, (name, result) in zip(axes, found.items(), strict=True):
