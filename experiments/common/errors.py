@@ -27,6 +27,22 @@ def relative_l2(image: Image, frame: Frame) -> float:
     return float(rel_l2(image, image_of, half_difference=noise))
 
 
+def squared_error(image: Image, frame: Frame) -> float:
+    """Measure an image's squared error, less the reference's noise.
+
+    Args:
+        image: in the frame's unit, [H,W,C].
+        frame: with a reference.
+
+    Returns:
+        the mean over pixels and channels, squared radiance.
+    """
+    assert frame.reference is not None
+    image_of, noise = frame.reference
+    square = np.square(np.asarray(image - image_of, np.float64))
+    return float(np.mean(square - np.square(np.asarray(noise, np.float64)) / 4))
+
+
 def geometric_mean(values: Iterable[float]) -> float:
     """Return the geometric mean of positive numbers."""
     return float(np.exp(np.mean(np.log([*values]))))

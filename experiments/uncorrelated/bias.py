@@ -1,57 +1,41 @@
 """How much of the error of uncorrelated kernels and of others is bias?
 
-Hundreds of independent realisations of synthetic frames (`synthetic`) and of rendered
-ones: four sub-averages of independent and four of common random numbers, and four more
-independent ones for the methods that have no use for common numbers. With the standard
-error of the squared bias over groups of realisations:
+Of many independent realisations (`realisations`) of synthetic and of rendered frames,
+with the standard error of the squared bias over groups of them, in normalised radiance:
 
     bias^2, variance, error   means over pixels, relative to squared radiance
+    plain bias^2              the mean that is not relative
     skewness                  Pearson's median skewness of the correlated estimates and
-                              of their differences within windows, mean of its size
+                              of their differences within windows: mean of its size, as
+                              in the paper, to which few realisations add; and root mean
+                              square without that, from two halves of the realisations
+    falls                     bias^2 and variance at the fewest over those at the most
+                              samples
 """
 
 import dataclasses
-import functools
-import itertools
 import pathlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Array
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from experiments.common.command import Options, main
 from experiments.common.report import Report
 from experiments.common.tables import table
-from experiments.data import synthetic
-from experiments.uncorrelated.error import with_gradients
-from jscomb import james_stein, uncorrelated
-from jscomb.denoisers import bilateral, oidn
-from jscomb.features import stack
-from jscomb.frame import Frame, make_frame
-from jscomb.rendering import Launcher, Pass, Settings
-from jscomb.typing import Image, Key
-
-SYNTHETIC = {"synthetic, symmetric": 0.0, "synthetic, skewed": 8.0}
-RENDERED = "cornell-glass", "cornell-glossy"
-CORRELATION = 0.9
-REACH = 7  # of differences whose skewness is measured
-FEATURE_SPP = 64
-METHODS = (
-    "path tracing",
-    "uniform",
-    "crosswise",
-    "uncorrelated",
-    "L2, uncorrelated",
-    "oidn",
-    "bilateral",
-    "james-stein",
+from experiments.uncorrelated.realisations import (
+    METHODS,
+    RENDERED,
+    SYNTHETIC,
+    Group,
+    Plan,
+    kept,
 )
+
+STEPS = 1, 3, 5, 7  # of differences whose skewness is measured, in pixels
 _EPSILON = 0.01  # of the relative error, squared normalised radiance
 
 
@@ -63,181 +47,30 @@ class Config(Options):
         work: folder that keeps the realisations.
         groups: of realisations, at least 3; errors of means are judged by them.
         of_each: realisations in a group.
-        samples: samples a pixel of one sub-average.
+        samples: samples a pixel of one sub-average, each in turn.
         size: width and height in pixels.
         window: width of the windows of methods with kernels.
+        frames: which of the synthetic and rendered ones.
     """
 
     work: tyro.conf.Positional[pathlib.Path]
     groups: int = 10
     of_each: int = 30
-    samples: int = 16
+    samples: tuple[int, ...] = (4, 16)
     size: int = 96
     window: int = 15
+    frames: tuple[str, ...] = (*SYNTHETIC, *RENDERED)
 
     def __post_init__(self) -> None:
-        """Groups are compared with each other."""
+        """Groups are compared with each other; frames have known names."""
         if self.groups < 3 or self.of_each < 2:
             raise ValueError(
                 "there must be at least 3 groups of 2 realisations, got "
                 f"{self.groups} of {self.of_each}"
             )
-
-
-class Group(NamedTuple):
-    """What a group of realisations leaves.
-
-    Attributes:
-        mean: mean image of each method, [M,H,W,C].
-        variance: of a realisation of each method, [M,H,W,C].
-        control: an unbiased image made of all samples, or the truth, [H,W,C].
-        correlated: mean correlated image of each realisation, [R,H,W,C].
-        gamma: that was chosen in each realisation, [R].
-    """
-
-    mean: np.ndarray
-    variance: np.ndarray
-    control: np.ndarray
-    correlated: np.ndarray
-    gamma: np.ndarray
-
-
-def methods(
-    guide: Frame, samples: int, window: int
-) -> Callable[[Array, Array], dict[str, Image]]:
-    """All images of one realisation, and gamma, of normalised radiance.
-
-    Args:
-        guide: a frame whose features guide the denoisers.
-        samples: samples a pixel of one sub-average.
-        window: width of the windows of kernels.
-
-    Returns:
-        a function of [8,H,W,C] independent and [4,H,W,C] correlated sub-averages.
-    """
-    features = stack(guide)
-
-    select, uniform, crosswise, combine, decorrelated = (
-        functools.partial(function, window=window)
-        for function in (
-            uncorrelated.select_gamma,
-            uncorrelated.combine_uniform,
-            uncorrelated.combine_crosswise,
-            uncorrelated.combine,
-            uncorrelated.combine_decorrelated,
-        )
-    )
-
-    def combined(independent: Array, z: Array) -> dict[str, Image]:
-        y, n = independent[:4], float(samples)
-        x = jnp.mean(independent, axis=0)
-        v = jnp.var(independent, axis=0, ddof=1) / len(independent)
-        halves = [jnp.mean(i.reshape(2, 2, *i.shape[1:]), axis=1) for i in (y, z)]
-        gamma, z_l2 = select(y, z, n), jax.vmap(with_gradients)(y, z)
-        denoised = oidn.denoise_normalised(x, albedo=guide.albedo, normal=guide.normal)
-        return {
-            "path tracing": x,
-            "uniform": uniform(y, z),
-            "crosswise": crosswise(y, z, select(y, z, n, crosswise=True), n),
-            "uncorrelated": combine(*halves, gamma, 2 * n),
-            "L2, uncorrelated": decorrelated(y, z_l2, select(y, z_l2, n), n),
-            "oidn": denoised,
-            "bilateral": bilateral.denoise(x, v, features),
-            "james-stein": james_stein.combine(
-                x, denoised, james_stein.robust_variance(v), window=7, whiten=True
-            ),
-            "gamma": gamma,
-        }
-
-    return combined
-
-
-def synthetic_groups(config: Config, skewness: float, skip: int = 0) -> Iterator[Group]:
-    """Groups of realisations of the synthetic frame, each by one vmap over keys."""
-    scene, n = synthetic.make_scene(config.size), config.samples
-    region = jax.nn.one_hot(scene.region, 3, dtype=jnp.float32)
-    guide = make_frame(scene.truth.astype(jnp.float32), albedo=region)
-    combined = methods(guide, n, config.window)
-
-    def draws(key: Key, count: int, correlation: float) -> Array:
-        draw = lambda k: synthetic.draw(
-            k, scene, n, correlation=correlation, skewness=skewness
-        )
-        return jax.vmap(draw)(jax.random.split(key, count)).astype(jnp.float32)
-
-    @jax.jit
-    @jax.vmap
-    def realise(key: Key) -> tuple[dict[str, Image], Image]:
-        of_y, of_z = jax.random.split(key)
-        z = draws(of_z, 4, CORRELATION)
-        return combined(draws(of_y, 8, 0.0), z), jnp.mean(z, axis=0)
-
-    for number in range(skip, config.groups):
-        keys = jax.random.split(jax.random.key(number), config.of_each)
-        images, correlated = realise(keys)
-        yield _group(images, np.asarray(correlated), np.asarray(scene.truth))
-
-
-def rendered_groups(config: Config, name: str, skip: int = 0) -> Iterator[Group]:
-    """Groups of realisations of an own scene; streams of numbers go by the group."""
-    of = lambda numbers: Launcher(name, Settings(size=config.size, numbers=numbers))
-    independent, common = of("independent"), of("common")
-    aov = independent(Pass("aov", FEATURE_SPP, 0, "aov"))
-    first = independent(Pass("color", FEATURE_SPP, 0, "path"))
-    guide = make_frame(
-        np.float32(first),
-        albedo=np.float32(aov[..., :3].clip(0, 1)),
-        normal=np.float32(aov[..., 3:6]),
-        depth=np.float32(aov[..., 6:7]),
-    )
-    combined = jax.jit(methods(guide, config.samples, config.window))
-    unit = float(guide.median_luminance)
-
-    def draws(launch: Callable, seeds: Iterator[int], count: int) -> Array:
-        each = [
-            launch(Pass("", config.samples, next(seeds), "path")) for _ in range(count)
-        ]
-        return jnp.asarray(np.stack(each) / unit, "float32")
-
-    for number in range(skip, config.groups):
-        seeds = itertools.count(1 + number * 10**6)
-        images, correlated = [], []
-        for _ in tqdm(range(config.of_each), desc=f"{name}, {number}", leave=False):
-            y, z = draws(independent, seeds, 8), draws(common, seeds, 4)
-            images.append(jax.tree.map(np.asarray, combined(y, z)))
-            correlated.append(np.mean(z, axis=0))
-        stacked = {k: np.stack([i[k] for i in images]) for k in images[0]}
-        yield _group(stacked, np.stack(correlated), None)
-
-
-def _group(
-    images: dict[str, Image], correlated: np.ndarray, truth: np.ndarray | None
-) -> Group:
-    """The statistics of realisations stacked on the first axis."""
-    images = {name: np.asarray(each, np.float64) for name, each in images.items()}
-    control = images["path tracing"].mean(axis=0) if truth is None else truth
-    each = [images[method] for method in METHODS]
-    return Group(
-        np.stack([i.mean(axis=0) for i in each]),
-        np.stack([i.var(axis=0, ddof=1) for i in each]),
-        control,
-        correlated,
-        images["gamma"],
-    )
-
-
-def kept(config: Config, name: str) -> list[Group]:
-    """All groups of a frame; those on disk are not made again."""
-    if name in SYNTHETIC:
-        make = lambda skip: synthetic_groups(config, SYNTHETIC[name], skip)
-    else:
-        make = lambda skip: rendered_groups(config, name, skip)
-    size = f"{config.size}-{config.samples}-{config.of_each}-{config.window}"
-    files = [config.work / f"{name}-{size}-{k}.npz" for k in range(config.groups)]
-    done = next((k for k, file in enumerate(files) if not file.exists()), len(files))
-    for file, group in zip(files[done:], make(done), strict=True):
-        np.savez(file, **group._asdict())
-    return [Group(**np.load(file)) for file in files]
+        if unknown := {*self.frames} - {*SYNTHETIC, *RENDERED}:
+            known = ", ".join([*map(repr, SYNTHETIC), *map(repr, RENDERED)])
+            raise ValueError(f"no frame {min(unknown)!r}; there are {known}")
 
 
 class Summary(NamedTuple):
@@ -246,12 +79,14 @@ class Summary(NamedTuple):
     Attributes:
         bias: squared, relative; without what chance adds to it.
         bias_error: its standard error.
+        plain: squared bias that is not relative, squared normalised radiance.
         variance: relative, of one realisation.
         map: relative bias of each pixel, mean over channels, noisy, [H,W].
     """
 
     bias: float
     bias_error: float
+    plain: float
     variance: float
     map: np.ndarray
 
@@ -262,7 +97,7 @@ def summary(groups: list[Group], method: int) -> Summary:
     weight = 1 / (truth.mean(axis=-1, keepdims=True) ** 2 + _EPSILON)
     away = np.stack([g.mean[method] - g.control for g in groups])
 
-    def squared(away: np.ndarray) -> float:
+    def squared(away: np.ndarray, weight: np.ndarray | float = weight) -> float:
         # Products of different groups: their errors are independent.
         k, total, same = len(away), away.sum(axis=0) ** 2, (away**2).sum(axis=0)
         return float(np.mean(weight * (total - same)) / (k * (k - 1)))
@@ -272,33 +107,54 @@ def summary(groups: list[Group], method: int) -> Summary:
     return Summary(
         squared(away),
         float(error),
+        squared(away, 1.0),
         float(np.mean([np.mean(weight * g.variance[method]) for g in groups])),
         (away.mean(axis=0) * weight**0.5).mean(axis=-1),
     )
 
 
-def skewness(samples: np.ndarray) -> np.ndarray:
-    """Size of Pearson's median skewness over the first axis; 0 where nothing varies."""
+def median_skewness(samples: np.ndarray) -> np.ndarray:
+    """Pearson's median skewness over the first axis; 0 where nothing varies."""
     mean, deviation = samples.mean(axis=0), samples.std(axis=0)
     some = deviation > 0
-    away = 3 * abs(mean - np.median(samples, axis=0))
+    away = 3 * (mean - np.median(samples, axis=0))
     return np.where(some, away / np.where(some, deviation, 1), 0)
 
 
-def skewness_of_differences(samples: np.ndarray, reach: int) -> float:
-    """Mean size of the skewness of D_ci z over all pairs of pixels in one window."""
+class Skewness(NamedTuple):
+    """Skewness of many pixels, over realisations.
+
+    Attributes:
+        size: mean of its size.
+        root: root mean square, without what chance adds to it.
+    """
+
+    size: float
+    root: float
+
+
+def skewness(images: Iterable[np.ndarray]) -> Skewness:
+    """That of all pixels of images, or of differences of images, [R,...] each."""
+    size = square = count = 0.0
+    for samples in images:
+        halves = median_skewness(samples[::2]), median_skewness(samples[1::2])
+        size += abs(median_skewness(samples)).sum()
+        square += (halves[0] * halves[1]).sum()
+        count += halves[0].size
+    return Skewness(size / count, max(square / count, 0.0) ** 0.5)
+
+
+def differences(samples: np.ndarray) -> Iterator[np.ndarray]:
+    """D_ci z of all pairs of pixels that are some `STEPS` apart, each pair once."""
     _, h, w, _ = samples.shape
-    total, count = 0.0, 0
-    for dy in range(min(reach, h - 1) + 1):
-        for dx in range(-reach, reach + 1):
-            if (dy, dx) <= (0, 0) or abs(dx) >= w:  # each pair once
+    across = sorted({0, *STEPS, *(-step for step in STEPS)})
+    for dy in (0, *STEPS):
+        for dx in across:
+            if (dy, dx) <= (0, 0) or dy >= h or abs(dx) >= w:
                 continue
             left, right = max(0, -dx), max(0, dx)
             c = samples[:, : h - dy, left : w - right]
-            i = samples[:, dy:, right : w - left]
-            found = skewness(i - c)
-            total, count = total + found.sum(), count + found.size
-    return total / count
+            yield samples[:, dy:, right : w - left] - c
 
 
 class Measured(NamedTuple):
@@ -311,29 +167,41 @@ class Measured(NamedTuple):
     """
 
     methods: dict[str, Summary]
-    skewness: tuple[float, float]
+    skewness: tuple[Skewness, Skewness]
     gamma: dict[float, int]
 
 
-def run(config: Config) -> dict[str, Measured]:
+Found = dict[str, dict[int, Measured]]
+
+
+def run(config: Config) -> Found:
     """Make and measure all realisations.
 
     Args:
         config: what, and where to keep it.
 
     Returns:
-        what is known, by frame.
+        what is known, by frame and samples.
 
     Raises:
         ImportError: if Open Image Denoise or Mitsuba is missing.
         ValueError: if there is no LLVM for common random numbers.
     """
     config.work.mkdir(parents=True, exist_ok=True)
-    names = [*SYNTHETIC, *RENDERED]
+    names = config.frames
+    plan = Plan(
+        config.work, config.groups, config.of_each, 0, config.size, config.window
+    )
     if config.quick:
-        config = dataclasses.replace(config, groups=3, of_each=4, size=24, window=5)
-        names = [names[1], names[2]]
-    return {name: measure(kept(config, name)) for name in tqdm(names, unit="frame")}
+        plan = plan._replace(groups=3, of_each=4, size=24, window=5)
+        names = names[1:3]
+    return {
+        name: {
+            n: measure(kept(plan._replace(samples=n), name))
+            for n in sorted(config.samples)
+        }
+        for name in tqdm(names, unit="frame")
+    }
 
 
 def measure(groups: list[Group]) -> Measured:
@@ -343,14 +211,14 @@ def measure(groups: list[Group]) -> Measured:
     values, counts = np.unique(gamma, return_counts=True)
     return Measured(
         {m: summary(groups, k) for k, m in enumerate(METHODS)},
-        (float(skewness(z).mean()), skewness_of_differences(z, REACH)),
+        (skewness([z]), skewness(differences(z))),
         dict(zip(values.tolist(), counts.tolist(), strict=True)),
     )
 
 
 def maps(found: dict[str, Measured]) -> Figure:
     """Maps of the bias: a row for each frame, a column for each method."""
-    size = 2 * len(METHODS), 2.3 * len(found)
+    size = 1.4 * len(METHODS), 1.75 * len(found)
     figure = Figure(figsize=size, layout="compressed")
     axes = figure.subplots(len(found), len(METHODS), squeeze=False)
     for row, (name, result) in zip(axes, found.items(), strict=True):
@@ -364,42 +232,92 @@ def maps(found: dict[str, Measured]) -> Figure:
     return figure
 
 
-def report(found: dict[str, Measured]) -> Report:
+def report(found: Found) -> Report:
     """Say what was found.
 
     Args:
         found: by `run`.
 
     Returns:
-        a table and a row of maps for each frame.
+        tables for each frame, and a row of maps at the most samples.
     """
+    least, most = (of(next(iter(found.values()))) for of in (min, max))
+    last = {name: by_samples[most] for name, by_samples in found.items()}
 
     def said(name: str, methods: dict[str, Summary]) -> str:
         ours, denoised = methods["uncorrelated"], methods["oidn"]
         share = max(ours.bias, 0) / (max(ours.bias, 0) + ours.variance)
-        return f"{share:.0%} of the error on {name} ({ours.bias / denoised.bias:.2g})"
+        return (
+            f"{share:.1%} of the error on {name} ({ours.bias / denoised.bias:.2g}, "
+            f"plain {ours.plain / denoised.plain:.2g})"
+        )
 
-    each = "; ".join(said(name, result.methods) for name, result in found.items())
+    each = "; ".join(said(name, result.methods) for name, result in last.items())
     answer = (
         "Squared bias of uncorrelated kernels, and in brackets its ratio to that of "
-        f"Open Image Denoise: {each}."
+        f"Open Image Denoise, at {most} samples in each sub-average: {each}."
     )
-    header = "bias^2", "its standard error", "/ uncorrelated's", "variance", "error"
-    parts = []
-    for name, result in found.items():
-        ours = result.methods["uncorrelated"].bias
-        cells = [
-            [m, s.bias, s.bias_error, s.bias / ours, s.variance, s.bias + s.variance]
-            for m, s in result.methods.items()
+    parts = [fall(found)] if least < most else []
+    for name, by_samples in found.items():
+        parts += [
+            part
+            for n, one in by_samples.items()
+            for part in (_errors(f"{name}, {n} samples", one), _skewed(one))
         ]
-        of_z, of_differences = result.skewness
-        chosen = ", ".join(f"{g:g} ({n} times)" for g, n in result.gamma.items())
-        parts.append(table([name, *header], cells))
-        parts.append(
-            f"Skewness {of_z:.3f}, of differences {of_differences:.3f} "
-            f"({of_z / of_differences:.2f} times less); gamma {chosen}."
-        )
-    return Report(answer, "\n\n".join(parts), {"Maps of the bias": maps(found)})
+    return Report(answer, "\n\n".join(parts), {"Maps of the bias": maps(last)})
+
+
+def _errors(title: str, one: Measured) -> str:
+    """A row for each method."""
+    ours = one.methods["uncorrelated"]
+    header = "bias^2", "its standard error", "/ uncorrelated's", "plain bias^2"
+    more = "/ uncorrelated's", "variance", "error"
+    cells = []
+    for m, s in one.methods.items():
+        plain = s.plain, s.plain / ours.plain
+        relative = s.bias, s.bias_error, s.bias / ours.bias
+        cells.append([m, *relative, *plain, s.variance, s.bias + s.variance])
+    return table([title, *header, *more], cells)
+
+
+def _skewed(one: Measured) -> str:
+    """Skewness and gamma in a sentence."""
+    of_z, of_differences = one.skewness
+    chosen = ", ".join(f"{g:g} ({n} times)" for g, n in one.gamma.items())
+    times = of_z.size / of_differences.size
+    return (
+        f"Size of the skewness {of_z.size:.3f}, of differences "
+        f"{of_differences.size:.3f} ({times:.2f} times less); root mean "
+        f"square {of_z.root:.3f} and {of_differences.root:.3f}; gamma {chosen}."
+    )
+
+
+def fall(found: Found) -> str:
+    """How much less squared bias and variance are at the most samples."""
+    names = "uncorrelated", "L2, uncorrelated", "oidn"
+    rows = []
+    for frame, by_samples in found.items():
+        least, most = min(by_samples), max(by_samples)
+        for method in names:
+            few, many = (by_samples[n].methods[method] for n in (least, most))
+            rows.append(
+                [
+                    f"{frame}, {method}",
+                    f"{most / least:g}",
+                    few.variance / many.variance,
+                    few.bias / many.bias,
+                    few.bias_error / few.bias,
+                    many.bias_error / many.bias,
+                    few.bias / few.variance,
+                    many.bias / many.variance,
+                ]
+            )
+    header = (
+        *("falls", "samples", "variance", "bias^2"),
+        *("relative error of the first bias^2", "of the second"),
+        *("bias^2 / variance, few", "many"),
+    )
+    return table(header, rows)
 
 
 if __name__ == "__main__":

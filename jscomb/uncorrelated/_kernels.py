@@ -63,8 +63,9 @@ def variance_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
 def median_kernel(gamma: Scalar | float, samples: Samples) -> Kernel:
     """Return a kernel by the median square of the pairs' differences.
 
-    One sub-average with a firefly does not change the median of three pairs or more:
-    a pixel keeps the weight that the others give it.
+    One sub-average with a firefly hardly changes the median where there are at least
+    five: less than half of the pairs have it. A pixel keeps the weight that the others
+    give it.
 
     Args:
         gamma: at least zero, per squared radiance.
