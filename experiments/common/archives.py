@@ -1,6 +1,6 @@
 """Frames from a folder of NumPy archives or EXR files, as `Frame`, for experiments.
 
-An EXR file is `SCENE-SAMPLES.exr`, by `experiments.data`, and read with two halves. An
+An EXR file is `SCENE-SAMPLES.exr`, by `experiments.data`, with its sub-buffers. An
 archive holds nested half buffers of S samples, `a_color_S` and `b_color_S`, with
 `a_variance_S` and `b_variance_S` of their means; denoised images `a_oidn_S`, `b_oidn_S`
 and `full_oidn_S`; features `a_albedo` and so on; `reference`, and the difference of its
@@ -34,7 +34,7 @@ def load(path: pathlib.Path, samples: int) -> Frame:
         ValueError: if the archive has no such sample count; names those it has.
     """
     if path.suffix == ".exr":
-        return exr.read_frame(path).merged(2)
+        return exr.read_frame(path)
     half = samples // 2
     with np.load(path) as data:
         if f"a_color_{half}" not in data:

@@ -63,7 +63,7 @@ def measured(
 
     Args:
         folders: of archives and EXR files.
-        measure: function of a normalised frame with two halves to numbers by name.
+        measure: function of a normalised frame to numbers by name.
         results: file that results are kept in; None to keep none.
         quick: only the first frame.
 

@@ -32,12 +32,12 @@ def test_archives_are_frames(folder, glass_frame):
 
 
 def test_exr_frames_are_measured_like_archives(glass_frame, tmp_path):
-    """By scene and samples, with two halves."""
+    """By scene and samples, with all sub-buffers."""
     exr.write_frame(tmp_path / "glass-64.exr", glass_frame)
     exr.write_frame(tmp_path / "glass-reference.exr", glass_frame)
     assert archives.cases(tmp_path) == [(tmp_path / "glass-64.exr", 64)]
-    found = archives.measured(tmp_path, {"": lambda f: {"halves": f.sub_buffers}})
-    assert found == {"glass 64": {"halves": 2}}
+    found = archives.measured(tmp_path, {"": lambda f: {"buffers": f.sub_buffers}})
+    assert found == {"glass 64": {"buffers": 4}}
     with pytest.raises(ValueError, match=r"no .npz archive and no EXR frame there"):
         archives.cases(tmp_path / "empty")
 
