@@ -1,6 +1,7 @@
-"""Frames from a folder of NumPy archives, as `Frame`, for experiments.
+"""Frames from a folder of NumPy archives or EXR files, as `Frame`, for experiments.
 
-An archive holds nested half buffers of S samples, `a_color_S` and `b_color_S`, with
+An EXR file is `SCENE-SAMPLES.exr`, by `experiments.data`, with its sub-buffers. An
+archive holds nested half buffers of S samples, `a_color_S` and `b_color_S`, with
 `a_variance_S` and `b_variance_S` of their means; denoised images `a_oidn_S`, `b_oidn_S`
 and `full_oidn_S`; features `a_albedo` and so on; `reference`, and the difference of its
 halves, `reference_half_difference`.
@@ -15,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.common.results import Results
+from jscomb import exr
 from jscomb.frame import CHANNELS, Estimate, Frame, Reference, make_frame
 
 
@@ -22,8 +24,8 @@ def load(path: pathlib.Path, samples: int) -> Frame:
     """One frame at one sample count.
 
     Args:
-        path: an archive.
-        samples: samples a pixel of the full frame; twice one of the S.
+        path: an archive, or an EXR file.
+        samples: samples a pixel of the full frame; in an archive twice one of the S.
 
     Returns:
         the frame: two sub-buffers, features, `oidn` with halves, and the reference.
@@ -31,6 +33,8 @@ def load(path: pathlib.Path, samples: int) -> Frame:
     Raises:
         ValueError: if the archive has no such sample count; names those it has.
     """
+    if path.suffix == ".exr":
+        return exr.read_frame(path)
     half = samples // 2
     with np.load(path) as data:
         if f"a_color_{half}" not in data:
@@ -75,19 +79,25 @@ def cases(
     """All frames of a folder.
 
     Args:
-        folder: of archives.
+        folder: of archives, EXR files, or both.
         quick: only the first, at its least sample count.
 
     Returns:
-        archives and sample counts, to `load`.
+        files and sample counts, to `load`.
 
     Raises:
-        ValueError: if the folder holds no archive.
+        ValueError: if the folder holds no frame.
     """
-    paths = sorted(folder.glob("*.npz"))
-    if not paths:
-        raise ValueError(f"{folder}: no .npz archive there")
-    every = [(path, samples) for path in paths for samples in sample_counts(path)]
+    every = [
+        (path, samples)
+        for path in sorted(folder.glob("*.npz"))
+        for samples in sample_counts(path)
+    ]
+    for path in sorted(folder.glob("*.exr")):
+        samples = path.stem.rpartition("-")[2]
+        every += [(path, int(samples))] if samples.isdecimal() else []
+    if not every:
+        raise ValueError(f"{folder}: no .npz archive and no EXR frame there")
     return every[:1] if quick else every
 
 
@@ -101,7 +111,7 @@ def measured(
     """Measure all frames of a folder, normalised.
 
     Args:
-        folder: of archives.
+        folder: of archives, EXR files, or both.
         measures: functions of a frame to numbers by name; what each is called.
         results: file of `Results`; None to keep none.
         quick: only the first frame.
@@ -111,12 +121,13 @@ def measured(
         called "".
 
     Raises:
-        ValueError: if the folder holds no archive.
+        ValueError: if the folder holds no frame.
     """
     kept, found = Results(results), {}
     for path, samples in tqdm(cases(folder, quick=quick), unit="frame"):
         frame = functools.cache(lambda p=path, s=samples: load(p, s).normalised())
         for kind, measure in measures.items():
-            name = f"{path.stem} {samples} {kind}".strip()
+            scene = path.stem.removesuffix(f"-{samples}")
+            name = f"{scene} {samples} {kind}".strip()
             found[name] = kept.get(name, lambda m=measure, f=frame: m(f()))
     return found

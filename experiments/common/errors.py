@@ -2,14 +2,18 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+import jax
 import numpy as np
 
 from experiments.common.tables import table
+from jscomb import metrics
 from jscomb.frame import Frame
 from jscomb.metrics import rel_l2
 from jscomb.typing import Image
 
 Row = Mapping[str, float]
+GREY = 0.18  # of a display, for the median luminance
+_dssim = jax.jit(metrics.dssim)
 
 
 def relative_l2(image: Image, frame: Frame) -> float:
@@ -41,6 +45,38 @@ def squared_error(image: Image, frame: Frame) -> float:
     image_of, noise = frame.reference
     square = np.square(np.asarray(image - image_of, np.float64))
     return float(np.mean(square - np.square(np.asarray(noise, np.float64)) / 4))
+
+
+def dssim(image: Image, frame: Frame) -> float:
+    """Measure an image's structural dissimilarity, as displayed: ACES, then sRGB.
+
+    Args:
+        image: of the normalised frame, whose median luminance is shown as 0.18.
+        frame: normalised, with a reference; its noise is not subtracted.
+
+    Returns:
+        the dissimilarity, (1 - SSIM) / 2.
+    """
+    assert frame.reference is not None
+    return float(_dssim(GREY * image, GREY * frame.reference.image))
+
+
+def fireflies(image: Image, frame: Frame) -> float:
+    """Measure the share of pixels that are far too bright for where they are.
+
+    Args:
+        image: of the normalised frame, [H,W,C].
+        frame: normalised, with a reference.
+
+    Returns:
+        the share whose mean over channels is more than twice the largest of the
+        reference in 5x5 pixels, and more than the median luminance above it.
+    """
+    assert frame.reference is not None
+    grey = np.asarray(image).mean(-1)
+    true = np.pad(np.asarray(frame.reference.image).mean(-1), 2, mode="edge")
+    near = np.lib.stride_tricks.sliding_window_view(true, (5, 5)).max(axis=(-2, -1))
+    return float(np.mean(grey > near + np.maximum(near, 1.0)))
 
 
 def geometric_mean(values: Iterable[float]) -> float:

@@ -2,14 +2,17 @@
 
 import functools
 import pathlib
+from collections.abc import Callable, Sequence
 
 import jax
 
+from experiments.common import archives
+from experiments.common.errors import Row
 from jscomb import rendering
 from jscomb.frame import Estimate, Frame, Maker, with_halves
 from jscomb.methods import METHODS
 
-BASES = "oidn", "oidn-color", "bilateral", "gaussian", "nonlocal-means", "rdfc"
+BASES = "oidn", "oidn-color", "bilateral", "nonlocal-means", "rdfc", "nfor"
 
 
 def maker(name: str) -> Maker:
@@ -44,11 +47,42 @@ def unbiased_of(frame: Frame) -> Estimate:
     return with_halves(frame, lambda part: part.color)
 
 
+def best(row: Row) -> float:
+    """Error of the best base."""
+    return min(row[base] for base in BASES)
+
+
+def measured(
+    folders: Sequence[pathlib.Path],
+    measure: Callable[[Frame], dict[str, float]],
+    *,
+    results: pathlib.Path | None,
+    quick: bool,
+) -> dict[str, dict[str, float]]:
+    """Measure all frames of some folders, see `archives`.
+
+    Args:
+        folders: of archives and EXR files.
+        measure: function of a normalised frame to numbers by name.
+        results: file that results are kept in; None to keep none.
+        quick: only the first frame.
+
+    Returns:
+        numbers by "folder/scene samples".
+    """
+    some = functools.partial(archives.measured, results=results, quick=quick)
+    return {
+        f"{folder.name}/{frame}": row
+        for folder in folders[: 1 if quick else None]
+        for frame, row in some(folder, {"": measure}).items()
+    }
+
+
 def rendered(scene: str, work: pathlib.Path, settings: rendering.Settings) -> Frame:
     """Render a scene, or take what a run has left.
 
     Args:
-        scene: name of a scene, see `jscomb.rendering`.
+        scene: name of a scene, see `jscomb.rendering`, or an XML file.
         work: .npz file that keeps what is rendered; its folder is made.
         settings: what is rendered.
 

@@ -56,7 +56,7 @@ def frames_of(config: Config) -> Mapping[str, Callable[[], Frame]]:
     """Functions that read or render each frame, by its name."""
     read = {name: functools.partial(exr.read_frame, name) for name in config.frames}
     files = {n: f for n, f in read.items() if n.endswith(".exr")}
-    return files | {
+    return {pathlib.Path(name).stem: f for name, f in files.items()} | {
         f"{scene} {samples}": functools.partial(
             rendered,
             scene,

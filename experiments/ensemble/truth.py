@@ -4,8 +4,8 @@ Renders each scene many times over, with two halves each (work done so far is ke
 the folder), and makes all bases of all renderings. From three quarters of them the true
 error matrices, of the full images and of halves; on the others, by relative L2 less the
 reference's noise, divided by that of the best base: weights from the true matrices,
-from all estimates <M> of the three quarters together, and from what each rendering can
-tell by itself.
+from all estimates <M> of the three quarters together, each of at least zero, one-hot
+and of either sign, and from what each rendering can tell by itself. DSSIM likewise.
 """
 
 import dataclasses
@@ -18,16 +18,19 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from experiments.common import errors
 from experiments.common.command import Options, main
-from experiments.common.errors import relative_l2
 from experiments.common.report import Report
+from experiments.common.results import Results
 from experiments.common.tables import table
-from experiments.ensemble.bases import BASES, bases_of, rendered
-from experiments.ensemble.weights import best, over
+from experiments.ensemble import methods
+from experiments.ensemble.bases import BASES, bases_of, best, rendered
+from experiments.ensemble.methods import METHODS, OURS, PAPER, Inputs
 from jscomb import ensemble
 from jscomb.frame import Buffers, Frame
 from jscomb.numerics import simplex
 from jscomb.rendering import Settings
+from jscomb.typing import Image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +38,9 @@ class Config(Options):
     """What to measure.
 
     Attributes:
-        scenes: names of scenes, see `jscomb.rendering`.
+        scenes: names of scenes, see `jscomb.rendering`, or XML files.
         work: folder that keeps what is rendered.
+        results: file that results are kept in; None to keep none.
         renderings: of each scene, at least four.
         samples: samples a pixel of each rendering.
         size: width and height in pixels.
@@ -45,10 +49,17 @@ class Config(Options):
 
     scenes: tyro.conf.Positional[tuple[str, ...]]
     work: pathlib.Path
+    results: pathlib.Path | None = None
     renderings: int = 32
     samples: int = 64
     size: int = 128
     reference_spp: int = 16384
+
+
+def _name(scene: str) -> str:
+    """What a scene is called: its own name, or its file's folder."""
+    path = pathlib.Path(scene)
+    return path.parent.name if path.suffix == ".xml" else scene
 
 
 def renderings_of(frame: Frame) -> list[Frame]:
@@ -64,38 +75,42 @@ def renderings_of(frame: Frame) -> list[Frame]:
     return [rendering(number) for number in range(count)]
 
 
-OURS, TRUE = "<M> multi-scale", "true M"
-OWN = {
-    "<M> of the pixel": simplex.hull,
-    "<M> over 7x7": over(7),
-    "<M> over 31x31": over(31),
-    "<M> over the frame": over(whole_frame=True),
-    OURS: functools.partial(ensemble.solve_weights, solver="multi-scale"),
-}
+TRUE, HALVES, ALL_RENDERINGS = "true M", "true M of halves", "<M> of all renderings"
+ONE_HOT, EITHER = ", one-hot", ", either sign"
+DSSIM = ", DSSIM"
+OWN = (
+    *(methods.ONE_HOT, methods.AFTER, methods.EITHER, methods.UNFILTERED, PAPER),
+    *("7x7", "31x31", "frame", OURS),
+)
+
+
+def each_of(given: Inputs) -> list[Inputs]:
+    """The inputs of single renderings."""
+    count = len(given.full)
+    return [Inputs(*(i[k] for i in given[:7]), *given[7:]) for k in range(count)]
 
 
 @jax.jit
-@jax.vmap
-def all_own(full, *halves):
-    """Images by what its own halves tell of each rendering."""
-    wide = lambda weights: jnp.broadcast_to(weights, full.shape)
-    return {n: ensemble.average(full, wide(weigh(*halves))) for n, weigh in OWN.items()}
-
-
-@jax.jit
-def true_weights(full, a, b, x_a, x_b, truth):
-    """Weights by many renderings."""
-    estimates = jax.vmap(ensemble.mse_matrix)(a, b, x_a, x_b)
+def true_weights(given: Inputs, truth: Image) -> dict[str, jax.Array]:
+    """Weights by many renderings: of at least zero, one-hot, and of either sign."""
+    estimates = jax.vmap(ensemble.mse_matrix)(*given.halves)
     matrices = {
-        TRUE: ensemble.true_matrix(full, truth),
-        "true M of halves": ensemble.true_matrix(a, truth),
-        "<M> of all renderings": jnp.mean(estimates, axis=0),
+        TRUE: ensemble.true_matrix(given.full, truth),
+        HALVES: ensemble.true_matrix(given.a, truth),
+        ALL_RENDERINGS: jnp.mean(estimates, axis=0),
     }
-    return {name: simplex.quadratic(m) for name, m in matrices.items()}
+    found = {}
+    for name, m in matrices.items():
+        found[name] = simplex.quadratic(m)
+        found[name + ONE_HOT] = ensemble.one_hot(
+            jnp.stack([m[k, k] for k in range(len(m))])
+        )
+        found[name + EITHER] = simplex.affine(m)
+    return found
 
 
 def measure(config: Config, scene: str) -> dict[str, float]:
-    """Relative L2 by method, mean over the judged renderings."""
+    """Relative L2 and DSSIM by method, means over the judged renderings."""
     settings = Settings(
         spp=config.renderings * config.samples,
         size=config.size,
@@ -103,25 +118,32 @@ def measure(config: Config, scene: str) -> dict[str, float]:
         feature_spp=4,
         reference_spp=config.reference_spp,
     )
-    frame = rendered(scene, config.work / f"{scene}.npz", settings).normalised()
+    name = _name(scene)
+    frame = rendered(scene, config.work / f"{name}.npz", settings).normalised()
     assert frame.reference is not None
-    every = renderings_of(frame)
-    bases, unbiased = [], []
-    for rendering in tqdm(every, unit="rendering", desc=scene):
-        bases.append(ensemble.stack_estimates(bases_of(rendering)))
-        unbiased.append([half.color for half in rendering.halves()])
-    full, a, b = (jnp.stack(i) for i in zip(*bases, strict=True))
-    x_a, x_b = (jnp.stack(i) for i in zip(*unbiased, strict=True))
-    known = 3 * len(every) // 4
-    data = [i[:known] for i in (full, a, b, x_a, x_b)]
-    full, a, b, x_a, x_b = (i[known:] for i in (full, a, b, x_a, x_b))
-    images = {name: full[:, k] for k, name in enumerate(BASES)}
-    images["average"] = jnp.mean(full, axis=1)
-    images |= all_own(full, a, b, x_a, x_b)
-    for name, w in true_weights(*data, frame.reference.image).items():
-        images[name] = jax.vmap(ensemble.average, (0, None))(full, w)
-    error = lambda some: np.mean([relative_l2(image, frame) for image in some])
-    return {name: float(error(some)) for name, some in images.items()}
+    made = []
+    for rendering in tqdm(renderings_of(frame), unit="rendering", desc=name):
+        made.append(methods.inputs_of(rendering, bases_of(rendering))[:7])
+    every = Inputs(
+        *(jnp.stack(each) for each in zip(*made, strict=True)),
+        albedo=frame.albedo,
+        normal=frame.normal,
+    )
+    known = 3 * len(made) // 4
+    some = lambda of: Inputs(*(i[of] for i in every[:7]), *every[7:])
+    known, judged = some(slice(known)), some(slice(known, None))
+    images = {name: judged.full[:, k] for k, name in enumerate(BASES)}
+    images["average"] = jnp.mean(judged.full, axis=1)
+    images |= {n: [METHODS[n](one) for one in each_of(judged)] for n in OWN}
+    for name, w in true_weights(known, frame.reference.image).items():
+        images[name] = jax.vmap(ensemble.average, (0, None))(judged.full, w)
+    row = {}
+    for name, some_images in images.items():
+        row[name] = float(np.mean([errors.relative_l2(i, frame) for i in some_images]))
+        row[name + DSSIM] = float(
+            np.mean([errors.dssim(i, frame) for i in some_images])
+        )
+    return row
 
 
 def run(config: Config) -> dict[str, dict[str, float]]:
@@ -131,13 +153,16 @@ def run(config: Config) -> dict[str, dict[str, float]]:
         config: what to measure.
 
     Returns:
-        relative L2 by scene and method.
+        relative L2 and DSSIM by scene and method.
     """
     if config.quick:
         config = dataclasses.replace(
             config, renderings=12, samples=4, size=24, reference_spp=1024
         )
-    return {scene: measure(config, scene) for scene in config.scenes}
+    kept = Results(config.results)
+    return {
+        s: kept.get(s, functools.partial(measure, config, s)) for s in config.scenes
+    }
 
 
 def report(rows: dict[str, dict[str, float]]) -> Report:
@@ -149,19 +174,31 @@ def report(rows: dict[str, dict[str, float]]) -> Report:
     Returns:
         ratios to the best base, by scene.
     """
-    names = list(next(iter(rows.values())))
+    names = [n for n in next(iter(rows.values())) if not n.endswith(DSSIM)]
+    titles = [_name(scene) for scene in rows]
     ratios = {n: [row[n] / best(row) for row in rows.values()] for n in names}
+    dissimilar = {
+        n: [r[n + DSSIM] / min(r[b + DSSIM] for b in BASES) for r in rows.values()]
+        for n in names
+    }
     span = lambda name: f"{min(ratios[name]):.2f} to {max(ratios[name]):.2f}"
     share = np.mean([1 - row[TRUE] / row[OURS] for row in rows.values()])
     answer = (
         f"With the true error matrices of every pixel the ensemble has {span(TRUE)} of "
-        f"the best base's relative L2, with those that a rendering's own halves tell "
-        f"at all scales {span(OURS)}: not knowing them is {share:.0%} of its error "
-        f"(mean of {len(rows)} scenes)."
+        f"the best base's relative L2 ({span(TRUE + ONE_HOT)} with one base a pixel, "
+        f"{span(TRUE + EITHER)} with weights of either sign), with those of halves "
+        f"{span(HALVES)}; with what a rendering's own halves tell {span(PAPER)} by the "
+        f"paper's weights of single pixels, filtered, {span(methods.EITHER)} by these "
+        f"of either sign, and {span(OURS)} at all scales: not knowing the matrices is "
+        f"{share:.0%} of that error (mean of {len(rows)} scenes)."
     )
+    header = [*titles, *(f"{title}, DSSIM" for title in titles)]
     return Report(
         answer,
-        table(["error / best base", *rows], [[n, *r] for n, r in ratios.items()]),
+        table(
+            ["error / best base", *header],
+            [[n, *r, *dissimilar[n]] for n, r in ratios.items()],
+        ),
     )
 
 

@@ -1,36 +1,37 @@
 """What does an ensemble of denoisers gain, and by which part of it?
 
-Every archive in the folder (`archives`), at every sample count. Bases: Open Image
-Denoise with and without features, joint bilateral, Gaussian, non-local means and RDFC;
-and the unbiased image. Relative L2, less the reference's noise, of normalised frames,
-divided by that of the best base, and time: of the plain average, of one-hot choices, of
-weights from single pixels, windows, the frame and all scales, filtered or not, with
-each channel by itself, of either sign, and with the unbiased image among the bases.
-Then every subset of the bases with the same method, ranked as in the paper's table 3.
-Results are kept in the file as they come, and what is in it is not measured again.
+Every frame of the folders (`archives`). Bases: Open Image Denoise with and without
+features, joint bilateral, non-local means, RDFC and NFOR; and the unbiased image. Of
+each base and method: relative L2, less the reference's noise, of normalised frames,
+divided by that of the best base; structural dissimilarity (DSSIM) after tone mapping,
+divided likewise; the share of pixels that are fireflies, see `errors.fireflies`; and
+time. Methods: the plain average, one-hot choices, weights of single pixels, windows,
+the frame and all scales, filtered or not, of each channel or shared, of at least zero
+or either sign, and with the unbiased image among the bases.
+
+No constant of these methods was set on frames of the data set (`test`, `validate`); the
+windows of multi-scale weights were set on other renderings of the archives' scenes.
 """
 
 import dataclasses
 import functools
-import itertools
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments.common import archives, errors
+from experiments.common import errors
 from experiments.common.command import Options, main
+from experiments.common.errors import Row
 from experiments.common.report import Report
 from experiments.common.tables import table
 from experiments.common.timing import medians
-from experiments.ensemble.bases import BASES, bases_of, unbiased_of
+from experiments.ensemble import methods
+from experiments.ensemble.bases import BASES, bases_of, best, measured, unbiased_of
+from experiments.ensemble.methods import METHODS, OURS, PAPER, Inputs, Method
 from jscomb import ensemble
-from jscomb.denoisers import nonlocal_means
 from jscomb.frame import Frame
-from jscomb.numerics import simplex
 from jscomb.typing import Image
 
 
@@ -39,157 +40,76 @@ class Config(Options):
     """What to measure.
 
     Attributes:
-        folder: of NumPy archives.
+        folders: of NumPy archives or EXR frames.
         results: file that results are kept in; None to keep none.
         repeats: timed calls of each method.
     """
 
-    folder: tyro.conf.Positional[pathlib.Path]
+    folders: tyro.conf.Positional[tuple[pathlib.Path, ...]]
     results: pathlib.Path | None = None
-    repeats: int = 3
+    repeats: int = 1
 
 
-PAPER, OURS, SELECTED = "pixel, filtered (the paper)", "multi-scale", "selected"
-SECONDS = ", seconds"
-
-
-def combined(**options) -> Callable:
-    """`ensemble.combine` with some options, compiled."""
-    return jax.jit(
-        lambda full, a, b, xa, xb, v, albedo, normal: ensemble.combine(
-            full, a, b, xa, xb, albedo=albedo, normal=normal, **options
-        )
-    )
-
-
-def selected(**options) -> Callable:
-    """One base a pixel by eq. 36 and 37, compiled."""
-    return jax.jit(
-        lambda full, a, b, xa, xb, v, albedo, normal: ensemble.combine(
-            *(full, a, b, xa, xb),
-            solver="one-hot",
-            variance_a=2 * v,
-            variance_b=2 * v,
-            albedo=albedo,
-            normal=normal,
-            **options,
-        )
-    )
-
-
-def weighed(weigh: Callable) -> Callable:
-    """The ensemble with weights from the halves, compiled."""
-    return jax.jit(
-        lambda full, *rest: ensemble.average(
-            full, jnp.broadcast_to(weigh(*rest[:4]), full.shape)
-        )
-    )
-
-
-def over(*windows: int, whole_frame: bool = False) -> Callable:
-    """Weights of least error over one window, or the frame."""
-    return lambda *halves: simplex.quadratic(
-        ensemble.error_matrix(*halves, windows=windows, whole_frame=whole_frame)
-    )
-
-
-def one_hot(window: int) -> Callable:
-    """The base of least error over a window, of all channels and relative."""
-
-    def weigh(*halves):
-        matrix = ensemble.error_matrix(*halves, windows=(window,), whole_frame=False)
-        return ensemble.one_hot(jnp.stack([m[k] for k, m in enumerate(matrix)]))
-
-    return weigh
-
-
-def smooth(images, z, noise, albedo, normal):
-    """Images of all bases under the filter for weights."""
-    return ensemble.filter_weights(images, z, noise, albedo=albedo, normal=normal)
-
-
-@jax.jit
-def one_hot_bilateral(full, a, b, xa, xb, v, albedo, normal):
-    """The base of least error, errors filtered like weights, by the noisy image."""
-    found = ensemble.selection_errors(a, b, xa, xb, 2 * v, 2 * v)
-    found = smooth(found, (xa + xb) / 2, v, albedo, normal)
-    return ensemble.average(full, ensemble.one_hot(found))
-
-
-@jax.jit
-def one_hot_means(full, a, b, xa, xb, v, albedo, normal):
-    """The base of least error, errors filtered by non-local means."""
-    found = ensemble.selection_errors(a, b, xa, xb, 2 * v, 2 * v)
-    found = jnp.moveaxis(found, 0, 2)
-    flat = found.reshape(*xa.shape[:2], -1)
-    filtered = nonlocal_means.denoise(flat, (xa + xb) / 2, v).reshape(found.shape)
-    return ensemble.average(full, ensemble.one_hot(jnp.moveaxis(filtered, 2, 0)))
-
-
-METHODS = {
-    "average": weighed(lambda a, *_: jnp.full_like(a, 1 / len(a))),
-    "one-hot, pixel": selected(filter=False),
-    "one-hot, errors cross-bilateral": one_hot_bilateral,
-    "one-hot, errors non-local means": one_hot_means,
-    "one-hot, weights filtered": selected(filter=True),
-    "one-hot, 31x31": weighed(one_hot(31)),
-    "pixel (the paper), no filter": combined(solver="hull", filter=False),
-    PAPER: combined(solver="hull", filter=True),
-    **{
-        f"{PAPER}, {name}": combined(solver="hull", filter=ensemble.Filter(**options))
-        for name, options in {
-            "variance blurred": {"blur": 2.0},
-            "weights clipped": {"clip": 1.0},
-            "normals standardised": {"standardise": True},
-            "all three": {"blur": 2.0, "clip": 1.0, "standardise": True},
-        }.items()
-    },
-    **{f"{w}x{w}": weighed(over(w)) for w in (7, 15, 31, 63)},
-    "frame": weighed(over(whole_frame=True)),
-    OURS: combined(solver="multi-scale", filter=False),
-    "multi-scale, filtered": combined(solver="multi-scale", filter=True),
-    "multi-scale, each channel": combined(
-        solver="multi-scale", filter=False, shared=False
-    ),
-    "31x31, either sign": weighed(
-        lambda *halves: simplex.affine(
-            ensemble.error_matrix(*halves, windows=(31,), whole_frame=False)
-        )
-    ),
-}
+SELECTED, NOISY = "selected", "path tracing"
+SECONDS, DSSIM, FIREFLIES = ", seconds", ", DSSIM", ", fireflies"
 WITH_UNBIASED = PAPER, "31x31", "frame", OURS, "multi-scale, filtered"
 ALL = *METHODS, *(f"{name} and x" for name in WITH_UNBIASED), SELECTED
+PAIRS = (
+    ("fig. 4", methods.EITHER, methods.UNFILTERED),
+    ("fig. 4", methods.EITHER_FILTERED, PAPER),
+    ("fig. 5", methods.ITERATIVE, PAPER),
+    ("fig. 7", methods.UNFILTERED, methods.SHARED_UNFILTERED),
+    ("fig. 7", PAPER, methods.SHARED),
+    ("fig. 7", methods.EACH_CHANNEL, OURS),
+    ("fig. 8", PAPER, methods.UNFILTERED),
+    ("fig. 8", "multi-scale, filtered", OURS),
+    ("the authors' program", methods.BLURRED, PAPER),
+    ("the authors' program", methods.CLIPPED, PAPER),
+    ("the authors' program", methods.STANDARD, PAPER),
+    ("the authors' program", methods.ALL_THREE, PAPER),
+    ("fig. 9", PAPER, methods.AVERAGE),
+    ("fig. 10", PAPER, methods.CROSS),
+    ("fig. 10", PAPER, methods.MEANS),
+    ("fig. 10", PAPER, methods.AFTER),
+    ("eq. 22-26", f"{PAPER} and x", PAPER),
+    ("ours", OURS, PAPER),
+    ("ours", OURS, methods.AFTER),
+)
+
+
+def judged(name: str, image: Image, frame: Frame) -> dict[str, float]:
+    """All that is measured of an image, under its name."""
+    return {
+        name: errors.relative_l2(image, frame),
+        name + DSSIM: errors.dssim(image, frame),
+        name + FIREFLIES: errors.fireflies(image, frame),
+    }
 
 
 def measure(frame: Frame, repeats: int) -> dict[str, float]:
-    """Errors of the bases, of all methods with their time, and of all subsets."""
-    x_a, x_b = (half.color for half in frame.halves())
-    rest = x_a, x_b, frame.variance, frame.albedo, frame.normal
-    bases, error = bases_of(frame), functools.partial(errors.relative_l2, frame=frame)
-    row = {"path tracing": error(frame.color)}
-    row |= {name: error(base.image) for name, base in bases.items()}
-    some = ensemble.stack_estimates(bases)
-    more = ensemble.stack_estimates(bases | {"x": unbiased_of(frame)})
+    """The bases and all methods of one normalised frame."""
+    bases = bases_of(frame)
+    row = judged(NOISY, frame.color, frame)
+    for name, base in bases.items():
+        row |= judged(name, base.image, frame)
+    some = methods.inputs_of(frame, bases)
+    more = methods.inputs_of(frame, bases | {"x": unbiased_of(frame)})
 
-    def add(name: str, method: Callable, images: Sequence[Image]) -> None:
-        call = functools.partial(method, *images, *rest)
-        row[name] = error(call())
+    def add(name: str, method: Method, given: Inputs) -> None:
+        nonlocal row
+        call = functools.partial(method, given)
+        row |= judged(name, call(), frame)
         row[name + SECONDS] = medians({name: call}, repeats)[name]
 
     for name, method in METHODS.items():
         add(name, method, some)
         if name in WITH_UNBIASED:
             add(f"{name} and x", method, more)
-    ours, names = METHODS[OURS], list(BASES)
-    for count in range(2, len(names)):
-        for subset in itertools.combinations(names, count):
-            images = ensemble.stack_estimates({name: bases[name] for name in subset})
-            row[" + ".join(subset)] = error(ours(*images, *rest))
-    select = lambda: ensemble.select_bases(some.biased_a, some.biased_b, x_a, x_b)
-    chosen = select().kept
-    needed = {names[k]: bases[names[k]] for k in chosen}
-    add(SELECTED, ours, ensemble.stack_estimates(needed))
-    row["selecting" + SECONDS] = medians({"": lambda: select().kept}, 1)[""]
+    select = lambda: ensemble.select_bases(*some.halves).kept
+    chosen = [list(BASES)[k] for k in select()]
+    needed = methods.inputs_of(frame, {name: bases[name] for name in chosen})
+    add(SELECTED, METHODS[OURS], needed)
+    row["selecting" + SECONDS] = medians({"": select}, 1)[""]
     row["selected, number"] = len(chosen)
     return row
 
@@ -201,49 +121,48 @@ def run(config: Config) -> dict[str, dict[str, float]]:
         config: what to measure.
 
     Returns:
-        errors and seconds by "frame samples" and method.
+        numbers by "folder/scene samples" and method.
 
     Raises:
-        ValueError: if the folder holds no archive.
+        ValueError: if a folder holds no frame.
     """
     of = functools.partial(measure, repeats=1 if config.quick else config.repeats)
-    return archives.measured(
-        config.folder, {"": of}, results=config.results, quick=config.quick
-    )
+    return measured(config.folders, of, results=config.results, quick=config.quick)
 
 
-def best(row: errors.Row) -> float:
-    """Error of the best base."""
-    return min(row[base] for base in BASES)
+def best_dssim(row: Row) -> float:
+    """Dissimilarity of the best base."""
+    return min(row[base + DSSIM] for base in BASES)
 
 
-def scores(rows: Sequence[errors.Row], names: Sequence[str]) -> dict[str, float]:
-    """Mean score of each candidate: as many as there are for the best, 1 for the worst.
-
-    Args:
-        rows: errors of each frame by candidate.
-        names: of the candidates.
-
-    Returns:
-        the scores by name, the best first.
-    """
-    each = np.array([[row[name] for name in names] for row in rows])
-    ranks = each.argsort(axis=1).argsort(axis=1)
-    mean = (len(names) - ranks).mean(axis=0)
-    found = dict(zip(names, mean.tolist(), strict=True))
-    return dict(sorted(found.items(), key=lambda each: -each[1]))
+def share(some: np.ndarray) -> str:
+    """How many of these are true, in per cent."""
+    return f"{np.mean(some):.0%}"
 
 
-def scored(rows: dict[str, dict[str, float]]) -> str:
-    """Every subset of the bases, the best first."""
-    every, groups = list(rows.values()), errors.by_samples(rows)
-    subsets = [n for n in every[0] if " + " in n] + [*BASES, OURS]
-    each = [scores(some, subsets) for some in groups.values()]
-    cells = (
-        ["all six" if name == OURS else name, score, *(s[name] for s in each)]
-        for name, score in scores(every, subsets).items()
-    )
-    return table(["bases", "score", *groups], cells)
+def pairs(rows: Mapping[str, Row]) -> str:
+    """Each of two methods' errors over the other's, and how often it is below."""
+    cells = []
+    for where, one, other in PAIRS:
+        cell = [where, one, other]
+        for kind in ("", DSSIM):
+            ratios = np.array([r[one + kind] / r[other + kind] for r in rows.values()])
+            cell += [errors.geometric_mean(ratios), share(ratios < 1)]
+        cells.append(cell)
+    header = ["in the paper", "one", "other", "relative L2: one / other"]
+    header += ["frames below", "DSSIM: one / other", "frames below"]
+    return table(header, cells)
+
+
+def by_folder(rows: Mapping[str, Row]) -> str:
+    """Means of each folder's frames by themselves."""
+    folders = sorted({name.partition("/")[0] for name in rows})
+    of = lambda f: [r for name, r in rows.items() if name.partition("/")[0] == f]
+    mean = lambda name, f: errors.geometric_mean(r[name] / best(r) for r in of(f))
+    some = (methods.AVERAGE, methods.AFTER, methods.UNFILTERED, PAPER, OURS, SELECTED)
+    cells = ([name, *(mean(name, f) for f in folders)] for name in some)
+    header = [f"{f}, {len(of(f))} frames" for f in folders]
+    return table(["error / best base", *header], cells)
 
 
 def report(rows: dict[str, dict[str, float]]) -> Report:
@@ -253,35 +172,46 @@ def report(rows: dict[str, dict[str, float]]) -> Report:
         rows: by `run`.
 
     Returns:
-        means beside times, every frame, and scores of all subsets.
+        means beside times, pairs of methods, folders, and every frame.
     """
-    every, groups = list(rows.values()), errors.by_samples(rows)
+    every = list(rows.values())
 
-    def time(name: str, unit: str = "average") -> float | None:
+    def time(name: str, unit: str = methods.AVERAGE) -> float | None:
         if name in BASES:
             return None
         return float(np.median([r[name + SECONDS] / r[unit + SECONDS] for r in every]))
 
+    def dissimilar(name: str) -> float:
+        return errors.geometric_mean(r[name + DSSIM] / best_dssim(r) for r in every)
+
+    def bright(name: str) -> str:
+        return f"{100 * np.mean([r[name + FIREFLIES] for r in every]):.3f}"
+
     def said(name: str) -> str:
-        ratios = [[row[name] / best(row) for row in g] for g in groups.values()]
-        means = ", ".join(f"{errors.geometric_mean(g):.2f}" for g in ratios)
-        return f"{means} (worst {max(map(max, ratios)):.2f})"
+        ratios = [r[name] / best(r) for r in every]
+        low = share(np.array(ratios) < 1)
+        mean = errors.geometric_mean(ratios)
+        return f"{mean:.2f} (worst {max(ratios):.2f}; below 1 in {low} of the frames)"
 
     number = np.mean([row["selected, number"] for row in every])
     answer = (
-        f"At {', '.join(map(str, groups))} samples an ensemble of {len(BASES)} bases "
-        f"has, in relative L2 divided by the best base's (geometric means of "
-        f"{len(rows)} frames in all), {said(OURS)} with multi-scale weights in "
-        f"{time(OURS):.0f} times the plain average's time; {said(SELECTED)} with the "
-        f"{number:.1f} bases that `select_bases` leaves in {time(SELECTED):.0f} times, "
-        f"selecting takes {time('selecting', OURS):.1f} times as long as combining all "
-        f"six; {said('31x31')} with weights over 31x31 pixels; and {said(PAPER)} with "
-        f"the paper's of single pixels, filtered, in {time(PAPER):.0f} times."
+        f"Over {len(rows)} frames an ensemble of {len(BASES)} bases has, in relative "
+        f"L2 over that of the frame's best base (geometric means), {said(PAPER)} with "
+        f"the paper's weights of single pixels, filtered, in {time(PAPER):.0f} times "
+        f"the plain average's time; {said(methods.UNFILTERED)} with these unfiltered; "
+        f"{said(OURS)} with multi-scale weights in {time(OURS):.0f} times; "
+        f"{said(SELECTED)} with the {number:.1f} bases that `select_bases` leaves. Of "
+        f"either sign at single pixels it is {said(methods.EITHER)}, with "
+        f"{bright(methods.EITHER)} % of the pixels fireflies, "
+        f"{bright(methods.UNFILTERED)} % at least zero."
     )
-    shown = [n for n in ALL if not n.startswith("one-hot, e") and n != "average"]
+    shown = [methods.AVERAGE, methods.AFTER, methods.UNFILTERED, PAPER, OURS, SELECTED]
     frames = (
-        [frame, *(row[n] for n in ("path tracing", *BASES))]
-        + [row[n] / best(row) for n in shown]
+        [
+            frame,
+            *(row[n] for n in (NOISY, *BASES)),
+            *(row[n] / best(row) for n in shown),
+        ]
         for frame, row in rows.items()
     )
     tables = [
@@ -290,14 +220,20 @@ def report(rows: dict[str, dict[str, float]]) -> Report:
             [*BASES, *ALL],
             best,
             title="error / best base",
-            beside={"time / average": time},
+            beside={
+                "DSSIM / best base": dissimilar,
+                "fireflies, %": bright,
+                "time / average": time,
+            },
         ),
+        f"Columns by samples a pixel have different scenes. Fireflies of the noisy "
+        f"image: {bright(NOISY)} %.",
+        "Two methods: geometric means over frames, and frames where one is below.",
+        pairs(rows),
+        by_folder(rows),
         "Every frame: errors of path tracing and of the bases, then ratios to the best "
         "base.",
-        table(["frame", "path tracing", *BASES, *shown], frames),
-        "Scores of all subsets with multi-scale weights: as many as there are subsets "
-        "for the best of a frame, 1 for the worst; means over frames.",
-        scored(rows),
+        table(["frame", NOISY, *BASES, *shown], frames),
     ]
     return Report(answer, "\n\n".join(tables))
 

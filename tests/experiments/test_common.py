@@ -14,6 +14,7 @@ from experiments.common.command import Options
 from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.james_stein import error
+from jscomb import exr
 
 FOLDERS = sorted(path.parent for path in index.EXPERIMENTS.glob("*/__init__.py"))
 ACCOUNTS = sorted(index.EXPERIMENTS.glob("*/account.py"))
@@ -28,6 +29,29 @@ def test_archives_are_frames(folder, glass_frame):
     np.testing.assert_allclose(frame.depth, glass_frame.depth, rtol=1e-6)
     with pytest.raises(ValueError, match=r"has \[64\] samples, not 128"):
         archives.load(folder / "glass.npz", 128)
+
+
+def test_exr_frames_are_measured_like_archives(glass_frame, tmp_path):
+    """By scene and samples, with all sub-buffers."""
+    exr.write_frame(tmp_path / "glass-64.exr", glass_frame)
+    exr.write_frame(tmp_path / "glass-reference.exr", glass_frame)
+    assert archives.cases(tmp_path) == [(tmp_path / "glass-64.exr", 64)]
+    found = archives.measured(tmp_path, {"": lambda f: {"buffers": f.sub_buffers}})
+    assert found == {"glass 64": {"buffers": 4}}
+    with pytest.raises(ValueError, match=r"no .npz archive and no EXR frame there"):
+        archives.cases(tmp_path / "empty")
+
+
+def test_fireflies_are_far_above_all_around(glass_frame):
+    frame = glass_frame.normalised()
+    truth = np.asarray(frame.reference.image)
+    assert errors.fireflies(truth, frame) == 0
+    assert errors.dssim(truth, frame) == pytest.approx(0, abs=1e-6)
+    bright = truth.copy()
+    bright[3, 4:6] += 3 * truth.max() + 1.1
+    pixels = truth.shape[0] * truth.shape[1]
+    assert errors.fireflies(bright, frame) == pytest.approx(2 / pixels)
+    assert errors.dssim(bright, frame) > 0
 
 
 def test_results_go_on_after_a_line_cut_short(tmp_path):

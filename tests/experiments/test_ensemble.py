@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.ensemble import dependence, solvers, truth, weights
+from experiments.ensemble import bases, dependence, solvers, subsets, truth, weights
 from jscomb import exr, metrics
 from jscomb.denoisers import oidn
 
@@ -11,22 +11,56 @@ from jscomb.denoisers import oidn
 def test_scores_are_ranks():
     """The best of three candidates scores 3, the worst 1; means over the frames."""
     rows = [{"a": 0.1, "b": 0.2, "c": 0.3}, {"a": 9.0, "b": 1.0, "c": 5.0}]
-    assert weights.scores(rows, ["a", "b", "c"]) == {"b": 2.5, "a": 2.0, "c": 1.5}
+    assert subsets.scores(rows, ["a", "b", "c"]) == {"b": 2.5, "a": 2.0, "c": 1.5}
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
 def test_ensembles_are_measured(folder, glass_frame):
-    rows = weights.run(weights.Config(folder, quick=True))
+    rows = weights.run(weights.Config((folder,), quick=True))
     (row,) = rows.values()
     r, noise = glass_frame.normalised().reference
     base = glass_frame.normalised().estimates["oidn"].image
     expected = metrics.rel_l2(base, r, half_difference=noise)
     np.testing.assert_allclose(row["oidn"], expected, rtol=1e-5)
     said = weights.report(rows)
-    ours = row["multi-scale"] / min(row[base] for base in weights.BASES)
-    assert f"{ours:.2f} (worst {ours:.2f}) with multi-scale weights" in said.answer
-    assert "| all six |" in said.body
+    ours = row["multi-scale"] / min(row[base] for base in bases.BASES)
+    low = "100%" if ours < 1 else "0%"
+    expected = (
+        f"{ours:.2f} (worst {ours:.2f}; below 1 in {low} of the frames) with multi"
+    )
+    assert expected in said.answer
+    assert f"| fig. 8 | {weights.PAPER} |" in said.body
+
+
+def test_cases_are_won_where_errors_are_less():
+    """An ensemble of half its best base's error wins, and more bases score more."""
+    rng = np.random.default_rng(0)
+    rows = {}
+    for samples in (4, 16):
+        row = {n: rng.uniform(1, 2) for n in (subsets.NOISY, *bases.BASES)}
+        for name, some in subsets.SUBSETS.items():
+            best = min(row[base] for base in some)
+            row |= {f"{name}: {form}": 2 * best for form in subsets.FORMS}
+            row[f"{name}: {subsets.PAPER}"] = best / len(some)
+        row |= {name + subsets.DSSIM: 3 - error for name, error in row.items()}
+        rows[f"test/random {samples}"] = row
+    said = subsets.report(rows)
+    assert "filter errors before in 100.0 % (by DSSIM 0.0 %; multi" in said.answer
+    assert "| all | 100.0 | 100.0 | 100.0 |" in said.body
+    ranked = subsets.scored(rows, subsets.PAPER)
+    assert next(iter(ranked)) == " + ".join(bases.BASES)
+    assert ranked[" + ".join(bases.BASES)]["mean"] == len(ranked)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not oidn.available(), reason="needs Open Image Denoise")
+def test_all_subsets_are_measured(folder):
+    rows = subsets.run(subsets.Config((folder,), quick=True))
+    (row,) = rows.values()
+    worst = max(row[base] for base in bases.BASES)
+    for name in subsets.SUBSETS:  # a convex mean is no worse than the worst base
+        assert 0 < row[f"{name}: {subsets.AVERAGE}"] < worst
 
 
 @pytest.mark.slow
