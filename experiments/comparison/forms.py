@@ -63,7 +63,7 @@ def james_steins(frame: Frame) -> Iterator[tuple[str, Image]]:
     for name, given in (("y", y), ("y*", star)):
         yield f"whitened, {name}", james_stein.combine_frame(frame, given).image
     network = shipped("njs")
-    inputs = james_stein.neural_inputs(key, frame, y)
+    inputs = james_stein.neural_inputs(jax.random.clone(key), frame, y)
     combine = compiled(james_stein.neural_combine)
     yield "njs", combine(network, **inputs)
     yield "njs, y", combine(network, frame.color, y.image, y.image, frame.variance)

@@ -129,8 +129,7 @@ def probes(frame: Frame, counts: tuple[int, ...], repeats: int) -> list[dict]:
         # All take turns with denoising alone, since a shared machine's pace changes; x
         # is an argument, or the compiler would denoise it beforehand.
         timed = {
-            key: functools.partial(call, jax.random.key(0), x)
-            for key, call in calls.items()
+            key: lambda c=call: c(jax.random.key(0), x) for key, call in calls.items()
         }
         seconds = medians({"": functools.partial(jax.jit(denoise), x)} | timed, repeats)
         for (way, count), call in calls.items():
