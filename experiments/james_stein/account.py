@@ -137,10 +137,10 @@ CLAIMS = (
         ),
         note="Tests hold it under Gaussian noise and a y apart from x. Below path "
         "tracing with OIDN: without a network in 20 of 20 frames, with it in 34 of 35 "
-        "(worst 1.40 times); with photon mapping james-stein in 17, njs in 19 of 20. "
-        "So it is no guarantee: path-traced noise is not Gaussian, a denoised y "
-        "follows x, and relative L2 weighs dark pixels more. The whitened form "
-        "dominates in units of the variance only.",
+        "(worst 1.40 times); with photon mapping both in 29 of 29. No guarantee: "
+        "path-traced noise is not Gaussian, a denoised y follows x, and relative L2 "
+        "weighs dark pixels more. The whitened form dominates in units of the "
+        "variance only.",
     ),
     Claim(
         "section 4.1",
@@ -362,18 +362,17 @@ CLAIMS = (
         where=("james_stein.combine_frame", "rendering.render"),
         measured=("experiments.double_shrinkage.photons",),
         note="Mitsuba 3 has no bidirectional path tracer: path tracing stands for it, "
-        "at equal samples. Over the better input, 20 frames: james-stein 0.645 (worst "
-        "1.01), njs 0.265 (1.17), trained on OIDN alone. Photon maps of before a "
-        "fault was mended: see double shrinkage, section 5.",
+        "at equal samples. Over the better input, 29 test frames: james-stein 0.436 "
+        "(worst 1.05), njs 0.234 (1.11), trained on OIDN alone.",
     ),
     Claim(
         "fig. 18",
         "convergence of the same: below both inputs",
         where=("experiments.double_shrinkage.photons",),
         measured=("experiments.double_shrinkage.photons",),
-        note="njs 0.136, 0.180, 0.167, 0.388, 0.513, 0.737 of the better input at 4 "
-        "to 4096 samples; path tracing is the better one from 64 samples on. Photon "
-        "maps have a fixed number of passes, so only path tracing converges.",
+        note="njs 0.204, 0.162, 0.189, 0.217, 0.295, 0.467 of the better input at 4 "
+        "to 4096 samples. Photon maps have a fixed number of passes, so only path "
+        "tracing converges.",
     ),
     Claim(
         "fig. 19",
