@@ -96,6 +96,69 @@ def test_agrees_with_path_tracing(vectorised):
             assert error < 0.05 * means[1][:, channel].mean()  # and it would be seen
 
 
+CORNER = """<scene version="3.0.0">
+  <sensor type="perspective">
+    <float name="fov" value="40"/>
+    <transform name="to_world"><lookat origin="0, 3, 4" target="0, .6, 0" up="0, 1, 0"/>
+    </transform>
+    <film type="hdrfilm"/>
+  </sensor>
+  <shape type="rectangle">
+    <transform name="to_world"><rotate x="1" angle="-90"/><scale value="2"/></transform>
+    <bsdf type="twosided">FLOOR</bsdf>
+  </shape>
+  <shape type="rectangle">
+    <transform name="to_world"><translate z="-1"/><scale value="2"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value=".8"/></bsdf>
+  </shape>
+  LIGHT
+</scene>"""
+FLOORS = {
+    "diffuse": '<bsdf type="diffuse"/>',
+    "sharp": '<bsdf type="roughplastic"><float name="alpha" value="0.02"/></bsdf>',
+    "metal": '<bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf>',
+    "principled": '<bsdf type="principled"/>',
+}
+AREA = """<shape type="rectangle">
+    <transform name="to_world"><scale value=".5"/><rotate x="1" angle="90"/>
+      <translate y="2.5"/></transform>
+    <emitter type="area"><rgb name="radiance" value="9"/></emitter>
+  </shape>"""
+TURNED = """<emitter type="envmap"><string name="filename" value="sky.exr"/>
+    <transform name="to_world"><rotate y="1" angle="90"/></transform>
+  </emitter>"""
+
+
+def corner(folder, floor, light):
+    """Write a scene of a floor and a wall, and return its path."""
+    sky = np.ones((8, 16, 3), np.float32)
+    rendering.mitsuba().Bitmap(sky).write(str(folder / "sky.exr"))
+    path = folder / "corner.xml"
+    path.write_text(CORNER.replace("FLOOR", FLOORS[floor]).replace("LIGHT", light))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("floor", "light"),
+    [("diffuse", TURNED), ("sharp", AREA), ("metal", AREA), ("principled", AREA)],
+)
+def test_agrees_with_path_tracing_whatever_floor_and_light(
+    vectorised, tmp_path, floor, light
+):
+    """In the distance and nearby, and no pixel stands out."""
+    settings = dataclasses.replace(SETTINGS, photons=30_000, radius=0.03)
+    launch = Launcher(corner(tmp_path, floor, light), settings)
+    first = passes()[0]
+    photons = [launch(first._replace(seed=k))[..., :3] for k in range(30)]
+    traced = [launch(Pass("", 64, 100 + k, "path")) for k in range(30)]
+    for part in (slice(2, 11), slice(13, 22)):
+        means = [np.stack(i)[:, part].mean((1, 2, 3)) for i in (photons, traced)]
+        difference = means[0] - means[1]
+        assert_mean(difference, 0.0)
+        assert difference.std(ddof=1) / 30**0.5 < 0.03 * means[1].mean()
+    assert np.mean(photons, axis=0).max() < 1.5 * np.mean(traced, axis=0).max()
+
+
 def test_light_of_lamps_is_seen_directly(launch):
     """The brightest pixel lies within the lamp; what it reflects besides is little."""
     image = launch(passes()[0])

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 
-def medians(functions: dict[str, Callable], repeats: int) -> dict[str, float]:
+def medians(functions: dict[Any, Callable], repeats: int) -> dict[Any, float]:
     """Median seconds of each function of no argument; they take turns.
 
     Args:
@@ -20,7 +20,7 @@ def medians(functions: dict[str, Callable], repeats: int) -> dict[str, float]:
     Returns:
         seconds by name.
     """
-    times: dict[str, list[float]] = {name: [] for name in functions}
+    times: dict[Any, list[float]] = {name: [] for name in functions}
     for repeat in range(repeats + 1):
         for name, function in functions.items():
             start = time.perf_counter()

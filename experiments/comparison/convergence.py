@@ -41,12 +41,18 @@ class Config(Options):
         metric: a metric of theirs that every seed has.
         biased: the sweep's work folder, to measure dominance on its frames; what is
             missing in the results is measured first.
+        scenes: with `biased`, as the sweep's.
+        spp: with `biased`, as the sweep's.
+        seeds: with `biased`, as the sweep's.
         combiners: whose curves to draw; all by default.
     """
 
     results: tyro.conf.Positional[pathlib.Path]
     metric: str = "relative L2"
     biased: pathlib.Path | None = None
+    scenes: tuple[str, ...] = sweep.Config.scenes
+    spp: tuple[int, ...] = sweep.Config.spp
+    seeds: int = sweep.Config.seeds
     combiners: tuple[str, ...] = ()
 
 
@@ -70,7 +76,14 @@ def measure_blurred(config: Config) -> None:
         config: with `biased`.
     """
     assert config.biased is not None
-    swept = sweep.Config(config.biased, config.results, quick=config.quick)
+    swept = sweep.Config(
+        config.biased,
+        config.results,
+        scenes=config.scenes,
+        spp=config.spp,
+        seeds=config.seeds,
+        quick=config.quick,
+    )
     names = tuple(n for n in swept.combiners if combiners()[n].traced or n == "njs")
     if config.quick:
         names = ("path tracing", "oidn", "whitened")

@@ -129,7 +129,7 @@ def cases(config: Config) -> Iterator[Case]:
         # Where Mitsuba and XLA have both compiled code, an exception may end a process.
         files, seconds = apart(_rendered, config, scene)
         for spp, seeds in files.items():
-            yield Case(scene, spp, _of_files(seeds), seconds)
+            yield Case(pathlib.Path(scene).stem, spp, _of_files(seeds), seconds)
 
 
 def _of_files(paths: list[pathlib.Path]) -> list[Frame]:

@@ -19,7 +19,7 @@ import dataclasses
 import functools
 import pathlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -36,11 +36,11 @@ from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.common.timing import medians
 from experiments.double_shrinkage import speed
+from experiments.double_shrinkage.picture import picture
 from jscomb import double_shrinkage, ensemble, james_stein, rendering
 from jscomb.denoisers import oidn
 from jscomb.features import stack
 from jscomb.frame import Frame
-from jscomb.metrics import tone_map
 from jscomb.rendering import PHOTONS, Launcher, Pass, Settings
 from jscomb.typing import Image
 
@@ -122,9 +122,14 @@ class Rendered(NamedTuple):
     passes: int
 
 
+def name_of(scene: str) -> str:
+    """An own scene's name, or that of an XML file's folder."""
+    return pathlib.Path(scene).parent.name if scene.endswith(".xml") else scene
+
+
 def rendered(config: Config, scene: str) -> Rendered:
     """Render a scene, or take what a run has left; normalised."""
-    name = pathlib.Path(scene).parent.name if scene.endswith(".xml") else scene
+    name = name_of(scene)
     kept = Results(config.work / "rates.jsonl")
     each = kept.get(f"{name} {config.size}", lambda: rates(config, scene))
     # The half has two buffers of two samples at least.
@@ -154,7 +159,6 @@ def rendered(config: Config, scene: str) -> Rendered:
 def methods(whole: Frame, half: Frame) -> dict[str, Callable[[], Image]]:
     """All images by name; those of half the time unless they say alone."""
     u, b = half.color, half.estimates[PHOTONS]
-    assert b.halves is not None
     v = james_stein.robust_variance(half.variance)
     assert b.halves is not None
     y_a, y_b = b.halves
@@ -334,38 +338,10 @@ def run(config: Config) -> Found:
         )  # fmt: skip
     config.work.mkdir(parents=True, exist_ok=True)
     scenes = {
-        scene: measure(rendered(config, scene), config.repeats)
+        name_of(scene): measure(rendered(config, scene), config.repeats)
         for scene in tqdm(config.scenes, unit="scene")
     }
     return Found(scenes, speed.ratios(config.timed_size, config.repeats))
-
-
-def picture(whole: Frame, half: Frame, images: Mapping[str, Image]) -> Figure:
-    """The images, and what share the biased image and the prior have."""
-    assert whole.reference is not None
-    found = double_shrinkage.make_inputs(half, half.estimates[PHOTONS])
-    share = double_shrinkage.factors(found.variance, found.mse, found.prior_mse)
-    shown = {
-        "reference": whole.reference.image,
-        "path tracing, all the time": images["path tracing alone"],
-        "photon mapping, all the time": images["photon mapping alone"],
-        "prior": found.prior,
-        "double shrinkage": images["double shrinkage"],
-        "james-stein, whitened": images["james-stein, whitened"],
-    }
-    figure = Figure(figsize=(14, 7.4), layout="compressed")
-    axes = figure.subplots(2, 4)
-    for axis, (name, image) in zip(axes.flat, shown.items(), strict=False):
-        axis.imshow(np.asarray(tone_map(image)), interpolation="nearest")
-        axis.set_title(name, fontsize=9)
-    shares = {"share of photons, k1": share.biased, "of the prior, k2": share.prior}
-    for axis, (name, image) in zip(axes.flat[6:], shares.items(), strict=True):
-        drawn = axis.imshow(np.mean(image, axis=-1), cmap="coolwarm", vmin=0, vmax=1)
-        axis.set_title(name, fontsize=9)
-        figure.colorbar(drawn, ax=axis, shrink=0.7)
-    for axis in axes.flat:
-        axis.axis("off")
-    return figure
 
 
 def report(found: Found) -> Report:

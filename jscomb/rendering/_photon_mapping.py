@@ -22,11 +22,17 @@ pixel waits for its first photons: more bias, less noise. But radii that follow 
 photons tie each pass to all before it. One radius a pass keeps passes independent, and
 so the halves and the variance that double shrinkage needs.
 
-A pass: photons leave the lights and are stored where they meet a surface that is not a
-mirror or glass, but for their first meeting, which is direct light. Eye paths go
-through mirrors and glass to the first other surface; its light is what lights shine on
-it directly, and the photons within the radius, each by the surface's own reflectance.
-What eye paths see of the lights is added.
+A pass: photons leave the lights and are stored where they meet a surface that reflects
+diffusely, but for their first meeting, which is direct light. Eye paths go on by
+whatever a surface has besides: mirrors, glass, gloss. At each surface they take what
+lights shine on it directly (on gloss weighted against what the path itself meets of the
+lights, by the balance heuristic), and the photons within the radius, each by the
+surface's diffuse reflectance alone: a photon is worth as much as the reflectance at its
+direction, and in a sharp highlight a single one would be a firefly. Principled
+materials of Mitsuba cannot be taken apart; photons light them as a whole.
+
+Photons count wherever they lie within the radius. A wall that is nearer than the radius
+to the inside of a lamp's housing takes its light, until the radius has shrunk.
 
 Source: T. Hachisuka, H. W. Jensen, "Stochastic progressive photon mapping", 2009; C.
 Knaus, M. Zwicker, "Progressive photon mapping: a probabilistic approach", 2011.
@@ -98,14 +104,30 @@ class PhotonMapper:
         state, sequence = mi.sample_tea_32(dr.opaque(mi.UInt32, seed, count), lane)
         return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
+    def _emitted(self, numbers):
+        """Rays from the lights, and their flux."""
+        mi = self.mi
+        pair = lambda: mi.Point2f(numbers.next_float32(), numbers.next_float32())
+        which, where, towards = numbers.next_float32(), pair(), pair()
+        ray, power, lamp = self.scene.sample_emitter_ray(
+            0.0, which, where, towards, True
+        )
+        # Mitsuba 3.9 lets the rays of a turned environment map start from a disk that
+        # is not turned, and so too many of them meet the scene.
+        around = self.scene.bbox().bounding_sphere()
+        radius = around.radius * (1 + mi.math.RayEpsilon)
+        disk = mi.warp.square_to_uniform_disk_concentric(where)
+        across = mi.Frame3f(ray.d).to_world(mi.Vector3f(disk.x, disk.y, 0))
+        far = mi.has_flag(lamp.flags(), mi.EmitterFlags.Infinite)
+        start = around.center + radius * (across - ray.d)
+        ray.o = self.dr.select(far, start, ray.o)
+        return ray, power
+
     def _traced(self, seed: int):
         """All meetings with surfaces, NumPy arrays; None, and more room, if short."""
         mi, dr, room = self.mi, self.dr, self.room
         numbers = self._numbers(2 * seed, self.count)
-        pair = lambda: mi.Point2f(numbers.next_float32(), numbers.next_float32())
-        ray, power, _ = self.scene.sample_emitter_ray(
-            0.0, numbers.next_float32(), pair(), pair(), True
-        )
+        ray, power = self._emitted(numbers)
         position, direction = dr.zeros(mi.Point3f, room), dr.zeros(mi.Vector3f, room)
         flux, edges = dr.zeros(mi.Color3f, room), dr.zeros(mi.UInt32, room)
         order, used = dr.zeros(mi.UInt32, room), dr.zeros(mi.UInt32, 1)
@@ -116,9 +138,9 @@ class PhotonMapper:
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
             bsdf = si.bsdf(ray)
-            smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
             # The first meeting is direct light, which eye paths take care of.
-            store = active & smooth & (depth > 0)
+            store = active & diffuse & (depth > 0)
             slot = dr.scatter_inc(used, mi.UInt32(0), store)
             store &= slot < room
             dr.scatter(position, si.p, slot, store)
@@ -198,68 +220,63 @@ class PhotonMapper:
         ray, weight = sensor.sample_ray(
             0.0, 0.5, (pixel + inside) / mi.Point2f(width, height), mi.Point2f(0.5)
         )
-        context, mirrors = mi.BSDFContext(), mi.BSDFContext()
-        mirrors.type_mask = int(mi.BSDFFlags.Delta)
 
-        def step(ray, weight, radiance, edges, active, found, numbers):
+        def step(ray, weight, radiance, edges, active, last, pdf, numbers):
             si = self.scene.ray_intersect(ray, active)
             lamp = si.emitter(self.scene, active)
-            radiance += dr.select(active, weight * lamp.eval(si, active), 0)
+            before = dr.zeros(mi.Interaction3f)
+            before.p = last
+            seen = mi.DirectionSample3f(self.scene, si, before)
+            by_lamp = active & (pdf > 0)
+            chance = self.scene.pdf_emitter_direction(before, seen, by_lamp)
+            share = dr.select(pdf > 0, pdf / (pdf + chance), 1)
+            radiance += dr.select(active, weight * share * lamp.eval(si, active), 0)
             active &= si.is_valid()
-            bsdf = si.bsdf(ray)
-            smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            mirror = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-            # A surface that is both is taken for either, every other time.
-            both = active & smooth & mirror
-            weight = dr.select(both, 2 * weight, weight)
-            stop = active & smooth & (~mirror | (numbers.next_float32(active) < 0.5))
-            found |= stop
-            active &= ~stop & mirror
-            first = numbers.next_float32(active)
-            second = mi.Point2f(
-                numbers.next_float32(active), numbers.next_float32(active)
-            )
-            sample, factor = bsdf.sample(mirrors, si, first, second, active)
+            surface = _Surface(mi, dr, si, ray, active)
+            lit = active & (edges < MAX_DEPTH)
+            radiance += dr.select(lit, weight * self._direct(surface, numbers, lit), 0)
+            flux = self._gathered(surface, edges, lit, radius, photons)
+            radiance += weight * flux / (math.pi * radius**2 * self.count)
+            active &= lit & surface.goes_on
+            out, factor, pdf = surface.sample(numbers, active)
             weight = dr.select(active, weight * factor, weight)
-            on = si.spawn_ray(si.to_world(sample.wo))
-            ray.o, ray.d = (
-                dr.select(active, on.o, ray.o),
-                dr.select(active, on.d, ray.d),
-            )
+            last = dr.select(active, si.p, last)
+            on = si.spawn_ray(out)
+            ray.o = dr.select(active, on.o, ray.o)
+            ray.d = dr.select(active, on.d, ray.d)
             edges = dr.select(active, edges + 1, edges)
-            active &= (edges <= MAX_DEPTH) & (dr.max(weight) > 0)
-            return ray, weight, radiance, edges, active, found, numbers
+            active &= dr.max(weight) > 0
+            return ray, weight, radiance, edges, active, last, pdf, numbers
 
         zero = dr.zeros(mi.Color3f, width * height)
-        ray, weight, radiance, edges, _, found, numbers = dr.while_loop(
-            (
-                mi.Ray3f(ray),
-                mi.Color3f(weight) + zero,
-                zero,
-                1 + 0 * lane,
-                lane >= 0,
-                lane < 0,
-                numbers,
-            ),
-            lambda ray, weight, radiance, edges, active, found, numbers: active,
+        ray, weight = mi.Ray3f(ray), mi.Color3f(weight) + zero
+        last, pdf = dr.zeros(mi.Point3f, width * height), mi.Float(zero.x)
+        _, _, radiance, *_ = dr.while_loop(
+            (ray, weight, zero, 1 + 0 * lane, lane >= 0, last, pdf, numbers),
+            lambda ray, weight, radiance, edges, active, last, pdf, numbers: active,
             step,
         )
-        si = self.scene.ray_intersect(ray, found)
-        found &= si.is_valid()
-        bsdf = si.bsdf(ray)
-        pair = mi.Point2f(numbers.next_float32(found), numbers.next_float32(found))
-        lit = found & (edges < MAX_DEPTH)
-        light, radiant = self.scene.sample_emitter_direction(si, pair, True, lit)
-        direct = radiant * bsdf.eval(context, si, si.to_local(light.d), lit)
-        radiance += dr.select(lit, weight * direct, 0)
-        flux = self._gathered(si, bsdf, context, edges, found, radius, photons)
-        radiance += weight * flux / (math.pi * radius**2 * self.count)
         return np.array(radiance).T.reshape(height, width, 3).astype(np.float64)
 
-    def _gathered(self, si, bsdf, context, edges, found, radius, photons: Photons):
-        """Sum over the photons within the radius of reflectance times power."""
+    def _direct(self, surface: "_Surface", numbers, active):
+        """Reflected light of one point of a lamp."""
         mi, dr = self.mi, self.dr
-        total = dr.zeros(mi.Color3f, dr.width(si.p))
+        pair = mi.Point2f(numbers.next_float32(active), numbers.next_float32(active))
+        light, radiant = self.scene.sample_emitter_direction(
+            surface.si, pair, True, active
+        )
+        towards = surface.si.to_local(light.d)
+        glossy, pdf = surface.rest(towards, active)
+        # Paths may meet the lamp by the rest, too, but for one that is a point.
+        alone = light.delta | (pdf <= 0)
+        share = dr.select(alone, 1, light.pdf / (light.pdf + pdf))
+        return radiant * (surface.diffuse(towards, active) + share * glossy)
+
+    def _gathered(self, surface: "_Surface", edges, found, radius, photons: Photons):
+        """Sum over the photons within the radius of reflectance times power."""
+        mi, dr, si = self.mi, self.dr, surface.si
+        total = dr.zeros(mi.Color3f, dr.width(edges))
+        found = found & surface.is_diffuse
         # Of the cells, two radii wide, the eight that the radius reaches.
         least = self._cell(si.p - radius, radius)
         for corner in np.ndindex(2, 2, 2):
@@ -280,13 +297,48 @@ class PhotonMapper:
                 cosine = abs(mi.Frame3f.cos_theta(wo))
                 near &= cosine > 0
                 power = dr.gather(mi.Color3f, photons.power, at)
-                light = bsdf.eval(context, si, wo, near) * power / cosine
+                light = surface.diffuse(wo, near) * power / cosine
                 return at + 1, total + dr.select(near, light, 0)
 
             _, total = dr.while_loop(
                 (at, total), lambda at, total, end=end: found & (at < end), add
             )
         return total
+
+
+class _Surface:
+    """What a path meets: a diffuse part, which photons light, and all the rest."""
+
+    def __init__(self, mi, dr, si, ray, active) -> None:
+        flags, self.mi, self.si, self.bsdf = mi.BSDFFlags, mi, si, si.bsdf(ray)
+        of = lambda some: mi.BSDFContext(mi.TransportMode.Radiance, some)
+        self._diffuse = of(int(flags.Diffuse))
+        self._rest = of(int(flags.Glossy) | int(flags.Delta))
+        has = lambda flag: mi.has_flag(self.bsdf.flags(), flag)
+        # Principled materials give all of themselves, whatever part is asked for.
+        mirrored = mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z)
+        rest = self.bsdf.eval(of(0), si, mirrored, active)
+        whole = dr.max(rest) > 0
+        self.is_diffuse = has(flags.Diffuse)
+        self.goes_on = ~whole & (has(flags.Glossy) | has(flags.Delta))
+
+    def diffuse(self, out, active):
+        """Reflectance of the diffuse part, times the cosine."""
+        return self.bsdf.eval(self._diffuse, self.si, out, active)
+
+    def rest(self, out, active):
+        """Reflectance of the rest, times the cosine, and its density."""
+        return self.bsdf.eval_pdf(self._rest, self.si, out, active & self.goes_on)
+
+    def sample(self, numbers, active):
+        """Go on by the rest: direction, weight, density; zero for that of a mirror."""
+        mi = self.mi
+        first = numbers.next_float32(active)
+        second = mi.Point2f(numbers.next_float32(active), numbers.next_float32(active))
+        sample, weight = self.bsdf.sample(self._rest, self.si, first, second, active)
+        smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth)
+        _, pdf = self.rest(sample.wo, active & smooth)
+        return self.si.to_world(sample.wo), weight, pdf
 
 
 def _hash(x, y, z):

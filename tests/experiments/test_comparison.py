@@ -11,6 +11,7 @@ from experiments.common import command, errors
 from experiments.comparison import (
     convergence,
     equal_time,
+    forms,
     members,
     page,
     pareto,
@@ -21,6 +22,7 @@ from experiments.comparison import (
 )
 from experiments.comparison.combiners import combiners
 from jscomb import exr, metrics
+from jscomb.denoisers import smoothing
 from jscomb.methods import METHODS
 
 FEW = ("path tracing", "oidn", "whitened")
@@ -253,3 +255,26 @@ def test_members_are_judged_without_their_scene(glass_frame, tmp_path):
     assert found["path"][0][0] == "oidn"
     said = members.report(found)
     assert f"{found['left out'][60.0]['a 64']:.3f}" in said.answer
+
+
+@pytest.mark.slow
+def test_forms_are_measured(glass_frame, tmp_path):
+    """Of a frame with two sub-buffers; the paper's bound stands apart from the rest."""
+    (tmp_path / "test").mkdir()
+    exr.write_frame(tmp_path / "test" / "glass-0000-64.exr", glass_frame)
+    rows = forms.run(forms.Config(tmp_path))
+    (row,) = rows.values()
+    errors_of = row["relative L2"]
+    assert np.isfinite(list(errors_of.values())).all()
+    frame = glass_frame.normalised()
+    r, noise = frame.reference
+    expected = metrics.rel_l2(frame.color, r, half_difference=noise)
+    assert errors_of["path tracing"] == pytest.approx(float(expected), rel=1e-5)
+    box = metrics.rel_l2(
+        smoothing.box(frame.color, window=15), r, half_difference=noise
+    )
+    assert errors_of["box"] == pytest.approx(float(box), rel=1e-4)
+    assert -1 <= row["prior"]["rank correlation of eta^2 and the prior's error"] <= 1
+    said = forms.report(rows)
+    ratio = errors_of["njs, dual"] / errors_of["njs"]
+    assert f"the dual form {ratio:.2f} of njs" in said.answer

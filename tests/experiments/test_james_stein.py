@@ -8,6 +8,7 @@ import pytest
 from experiments.common import archives
 from experiments.james_stein import (
     error,
+    lights,
     parts,
     regression,
     weak_denoisers,
@@ -54,6 +55,25 @@ def test_regression_is_measured(folder, tmp_path):
     said = regression.report(measured)
     assert f"{row['y*'] / row['y']:.2f} of its error" in said.answer
     assert f"| {row['y']:#.3g} |" in said.body
+
+
+def test_pixels_beside_lights_are_told_apart(glass_frame, tmp_path):
+    """Within three pixels of a bright one, but not the light; of a frame's file."""
+    level = np.ones((20, 20, 3), np.float32)
+    level[8, 9] = 30
+    reference = glass_frame.reference._replace(image=level)
+    found = lights.beside_lights(glass_frame._replace(reference=reference))
+    expected = np.zeros((20, 20), bool)
+    expected[5:12, 6:13] = True
+    expected[8, 9] = False
+    np.testing.assert_array_equal(found, expected)
+    (tmp_path / "test").mkdir()
+    exr.write_frame(tmp_path / "test" / "glass-0000-64.exr", glass_frame)
+    rows = lights.run(lights.Config(tmp_path))
+    for row in rows.values():
+        pixels = sum(part["pixels"] for part in row.values())
+        assert pixels == glass_frame.color.shape[0] * glass_frame.color.shape[1]
+    assert f"In {len(rows)} frames" in lights.report(rows).answer or not rows
 
 
 def test_useful_operations_are_those_of_clipped_windows():
