@@ -381,11 +381,11 @@ def test_without_mitsuba(jscomb, tmp_path, monkeypatch):
 def test_the_command_says_what_makes_it_faster(
     jscomb, tmp_path, monkeypatch, glass_frame
 ):
-    """Before it renders, where there is no LLVM."""
+    """Where there is no LLVM."""
     slow = types.SimpleNamespace(variant=lambda: "scalar_rgb")
     monkeypatch.setattr(rendering, "mitsuba", lambda: slow)
     monkeypatch.setattr(_rendering, "render_file", lambda *_, **__: glass_frame)
     status, said, _ = jscomb("render", SCENE, "-o", tmp_path / "frame.exr")
     assert status == 0
-    assert said.startswith("no LLVM 17 or newer: ")
-    assert "apt install libllvm19" in said.splitlines()[0]
+    (line,) = [line for line in said.splitlines() if "LLVM" in line]
+    assert "apt install libllvm19" in line

@@ -95,6 +95,8 @@ def test_wrong_folders_are_refused_before_the_work(frames, tmp_path):
     exr.write_frame(one / "bare-64.exr", bare)
     with pytest.raises(ValueError, match=r"bare-64\.exr: training needs a reference"):
         train(one, tmp_path / "run")
+    with pytest.raises(ValueError, match="no frame of 512x512 pixels or more"):
+        train(frames, tmp_path / "run", cli.Run("njs", "light", piece=512))
     with pytest.raises(ValueError, match="no estimate 'photons'"):
         train(frames, tmp_path / "photons", cli.Run("dsc-photons", "light", piece=32))
     assert not (tmp_path / "run" / "network.safetensors").exists()

@@ -18,7 +18,7 @@ _File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 _Settings = Annotated[rendering.Settings, tyro.conf.arg(name="")]
 _DEFAULT = rendering.Settings()
 _SLOW = (
-    "no LLVM 17 or newer: Mitsuba renders two to three times slower; on Debian: "
+    "without LLVM 17 or newer Mitsuba renders two to three times slower; on Debian: "
     "apt install libllvm19"
 )
 
@@ -52,8 +52,6 @@ def render(
     check_is_new(os.fspath(out), force=force)
     if reference_from is not None:
         check_inputs_stay([os.fspath(out)], [os.fspath(reference_from)])
-    if rendering.mitsuba().variant().startswith("scalar"):
-        print(_SLOW, flush=True)
     frame = render_file(
         scene, out, settings, reference_from=reference_from, denoise=denoise
     )
@@ -64,6 +62,8 @@ def render(
         f"wrote {out}: {tables.size(frame)}, {tables.samples(frame)}"
         f"{''.join(f', {name}' for name in also)}"
     )
+    if rendering.mitsuba().variant().startswith("scalar"):
+        print(_SLOW)
 
 
 def render_file(

@@ -146,7 +146,8 @@ def train_files(
     about = _about(run, recipe, files, held_files)
     card = _resume(out, about)
     if not card:
-        check_files([*files, *held_files])
+        for each in (files, held_files):
+            check_files(each, piece=run.piece)
     out.mkdir(parents=True, exist_ok=True)
     made = functools.partial(prepare, recipe, cache=out / "inputs", piece=run.piece)
     held, drawn = made(held_files, variants=False), made(files).examples
@@ -284,23 +285,30 @@ def prepare(
     return examples.stack_examples(found)
 
 
-def check_files(files: Sequence[pathlib.Path]) -> None:
-    """Raise if a frame has nothing to train on, before anything is computed.
+def check_files(files: Sequence[pathlib.Path], *, piece: int = 1) -> None:
+    """Raise if frames cannot be trained on, before anything is computed.
 
     Args:
         files: of frames.
+        piece: width and height in pixels that one of them must have.
 
     Raises:
-        ValueError: if one cannot be trained on; names the file.
+        ValueError: if one has no target, or all are too small; names the file.
     """
     from jscomb.learning import examples
 
+    largest = 0
     for file in tqdm(files, unit="frame", desc="check", leave=False, disable=None):
         try:
-            examples.with_target(exr.read_frame(file))
+            frame = examples.with_target(exr.read_frame(file))
         except ValueError as error:
             named = str(error).startswith(str(file))
             raise ValueError(str(error) if named else f"{file}: {error}") from None
+        largest = max(largest, min(frame.color.shape[:2]))
+    if largest < piece:
+        raise ValueError(
+            f"{files[0].parent}: no frame of {piece}x{piece} pixels or more (--crop)"
+        )
 
 
 def with_bases(recipe: "Recipe", frame: Frame) -> Frame:
