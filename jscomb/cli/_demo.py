@@ -2,8 +2,10 @@
 
 import contextlib
 import multiprocessing
+import os
 import signal
 import statistics
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
@@ -102,6 +104,7 @@ def _other_process(file: Path, names: Sequence[str]) -> Iterator[Connection]:
 def _serve(ours: Connection, file: Path, names: Sequence[str]) -> None:
     """What the other process does."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # the first process says that it ends
+    threading.Thread(target=_end_with_the_first, daemon=True).start()
     frame = exr.read_frame(file)
     with contextlib.suppress(EOFError, BrokenPipeError), ours:  # the first has ended
         made = _made(frame, names)
@@ -111,6 +114,14 @@ def _serve(ours: Connection, file: Path, names: Sequence[str]) -> None:
         ours.recv()
         there = [name for name in names if not isinstance(made[name], str)]
         ours.send(_ms(frame, there))
+
+
+def _end_with_the_first() -> None:
+    """End this process, whatever it computes, when the first one has ended."""
+    first = multiprocessing.parent_process()
+    assert first is not None
+    first.join()
+    os._exit(1)
 
 
 def _received(papers: Connection) -> dict:
