@@ -13,8 +13,7 @@ import pytest
 
 import jscomb as package
 from jscomb import exr, metrics
-from jscomb.cli import _showing
-from jscomb.cli._showing import SHOWN
+from jscomb.cli import _demo
 from jscomb.exr._files import read_parts
 from jscomb.frame import Estimate
 from jscomb.methods import BASES, METHODS, TIERS
@@ -31,51 +30,46 @@ def errors_in(text, column=0):
     return {name: float(values.split()[column]) for name, values in rows}
 
 
-def demonstrate(jscomb, folder, shown=SHOWN):
-    """Run the demo; returns the errors at few and at many samples, by method."""
-    status, out, _ = jscomb("demo", "--out", folder)
-    assert status == 0
-    few, many = errors_in(out, 0), errors_in(out, 1)
-    methods = {"path tracing", *shown, *_showing.TIERS}
-    assert few.keys() == many.keys() == methods
-    assert all(many[name] < few[name] for name in methods)
-    assert {p.name for p in folder.iterdir()} == {
-        "comparison.png",
-        *(
-            f"cornell-glass-{n}-{m}.exr"
-            for n in (64, 1024)
-            for m in (*shown, *_showing.TIERS)
-        ),
-    }
-    assert os.fspath(folder.resolve()) in out
-    return few, many
-
-
-@pytest.mark.slow
-def test_demo(jscomb, tmp_path):
-    for errors in demonstrate(jscomb, tmp_path / "demo"):
-        assert errors["best"] < 1.02 * errors["balanced"]
-        assert errors["balanced"] < errors["fast"]
-        assert errors["fast"] < errors["denoised"]
-
-
-def test_demo_of_small_frames(jscomb, tmp_path, monkeypatch):
-    """The same of corners of crops of the frames, each timed once; no networks."""
+def test_demo_of_a_small_frame(jscomb, tmp_path, monkeypatch, glass_frame):
+    """A corner of a crop of the bundled frame, by a method of each process."""
     corner = lambda i: i[..., :24, :24, :] if i.ndim > 2 else i
-    small = {}
-    for name in ("cornell-glass-64", "cornell-glass-1024"):
-        small[name] = tmp_path / f"{name}.exr"
-        frame = exr.read_frame(DATA / f"{name}.exr")
-        exr.write_frame(small[name], jax.tree.map(corner, frame))
-    monkeypatch.setattr(exr, "bundled", lambda: small)
-    monkeypatch.setattr(_showing, "TIMED_RUNS", 1)
-    monkeypatch.setattr(_showing, "SHOWN", SHOWN[:3])
-    monkeypatch.setattr(_showing, "TIERS", ("fast",))
-    for errors in demonstrate(jscomb, tmp_path / "demo", SHOWN[:3]):
-        assert errors["fast"] < errors["denoised"]
+    small, out = tmp_path / "small.exr", tmp_path / "demo"
+    exr.write_frame(small, jax.tree.map(corner, glass_frame))
+    monkeypatch.setattr(exr, "bundled", lambda: {_demo.NAME: small})
+    monkeypatch.setattr(_demo, "PAPERS", ("whitened",))
+    monkeypatch.setattr(_demo, "TIERS", ("fast",))
+    status, said, _ = jscomb("demo", "--out", out)
+    assert status == 0
+    rows = dict(re.findall(r"^ {2}(\S.*?) {2,}(0\.\d+)", said, re.M))
+    assert [*rows] == ["path tracing", "denoised", "whitened", "fast"]
+    assert re.search(r"^  fast +0\.\d+ +\d", said, re.M)
+    frame = exr.read_frame(small)
+    files = {path.name for path in out.iterdir()}
+    assert files == {
+        "comparison.png",
+        f"{_demo.NAME}-whitened.exr",
+        f"{_demo.NAME}-fast.exr",
+    }
+    r, noise = frame.reference
+    for name in ("whitened", "fast"):
+        image = exr.read_image(out / f"{_demo.NAME}-{name}.exr")
+        found = float(metrics.rel_l2(image, r, half_difference=noise))
+        np.testing.assert_allclose(float(rows[name]), found, atol=6e-6)
 
 
-@pytest.mark.parametrize("method", ["auto", "fast", *SHOWN, "bilateral", "ensemble"])
+def test_demo_needs_no_extra(glass_frame, monkeypatch):
+    """It says what is left out, and what to install."""
+    there = importlib.util.find_spec
+    gone = lambda name: None if name == "pyoidn" else there(name)
+    monkeypatch.setattr(importlib.util, "find_spec", gone)
+    made = _demo._made(glass_frame, ["pd", "denoised"])
+    assert made["pd"] == 'needs the package pyoidn: pip install "jscomb[oidn]"'
+    assert made["denoised"].shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize(
+    "method", ["auto", "fast", "denoised", *_demo.PAPERS, "bilateral", "ensemble"]
+)
 def test_combine_writes_what_it_reports(jscomb, tmp_path, method, glass_frame):
     path = tmp_path / "out.exr"
     status, out, _ = jscomb("combine", GLASS, "-o", path, "--method", method)

@@ -1,5 +1,7 @@
 """The table of methods, and the default one in its tiers."""
 
+import importlib.util
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -312,6 +314,25 @@ def test_an_ensemble_says_what_it_skips(glass_frame):
     assert skipped["bilateral"].startswith("needs half buffers: render at least 2")
     with pytest.raises(ValueError, match=r"no bases: .*y it has no halves"):
         combine(key(), bare, method="ensemble", biased="y")
+
+
+def test_tiers_without_open_image_denoise(glass_frame, monkeypatch):
+    """A frame's own denoised image is combined; what needs it of each half is not."""
+    there = importlib.util.find_spec
+    gone = lambda name: None if name == "pyoidn" else there(name)
+    monkeypatch.setattr(importlib.util, "find_spec", gone)
+    names, skipped = methods.inputs(
+        glass_frame.normalised(), biased=TIERS["best"].bases
+    )
+    assert "oidn" in names
+    for name in ("double-shrinkage", "pd", "oidn-clean"):
+        assert "pip install" in skipped[name]
+    small = jax.tree.map(
+        lambda i: i[..., :16, :16, :] if i.ndim > 2 else i, glass_frame
+    )
+    made = combine_tier(key(), small, tier="best")
+    assert made.bases == names
+    assert jnp.isfinite(made.estimate.image).all()
 
 
 def test_bad_input(glass_frame):

@@ -1,13 +1,14 @@
 """Rendering with Mitsuba 3: statistics that are what they say, and resuming."""
 
 import dataclasses
+import types
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jscomb import exr, rendering
-from jscomb.cli import render_file
+from jscomb.cli import _rendering, render_file
 from jscomb.denoisers import oidn
 from jscomb.frame import Needs, Package
 from jscomb.rendering import Settings, _partial, _scenes
@@ -375,3 +376,16 @@ def test_without_mitsuba(jscomb, tmp_path, monkeypatch):
     assert status == 2
     line = 'jscomb: rendering needs the package nowhere: pip install "jscomb[render]"'
     assert error == f"{line}\n"
+
+
+def test_the_command_says_what_makes_it_faster(
+    jscomb, tmp_path, monkeypatch, glass_frame
+):
+    """Where there is no LLVM."""
+    slow = types.SimpleNamespace(variant=lambda: "scalar_rgb")
+    monkeypatch.setattr(rendering, "mitsuba", lambda: slow)
+    monkeypatch.setattr(_rendering, "render_file", lambda *_, **__: glass_frame)
+    status, said, _ = jscomb("render", SCENE, "-o", tmp_path / "frame.exr")
+    assert status == 0
+    (line,) = [line for line in said.splitlines() if "LLVM" in line]
+    assert "apt install libllvm19" in line

@@ -10,7 +10,7 @@ import pytest
 
 from jscomb import cli, exr, james_stein, metrics
 from jscomb.cli import _training
-from jscomb.learning import recipes, training
+from jscomb.learning import examples, recipes, training
 from jscomb.learning.recipes import RECIPES
 
 RUN = cli.Run("kernels", "light", steps=4, batch=2, crop=16, piece=32, validate=1)
@@ -95,9 +95,39 @@ def test_wrong_folders_are_refused_before_the_work(frames, tmp_path):
     exr.write_frame(one / "bare-64.exr", bare)
     with pytest.raises(ValueError, match=r"bare-64\.exr: training needs a reference"):
         train(one, tmp_path / "run")
+    with pytest.raises(ValueError, match="no frame of 512x512 pixels or more"):
+        train(frames, tmp_path / "run", cli.Run("njs", "light", piece=512))
     with pytest.raises(ValueError, match="no estimate 'photons'"):
         train(frames, tmp_path / "photons", cli.Run("dsc-photons", "light", piece=32))
     assert not (tmp_path / "run" / "network.safetensors").exists()
+
+
+def test_without_references_half_of_the_samples_are_the_target(
+    frames, tmp_path, glass_frame
+):
+    """Of frames with four sub-buffers; training sees the other half only."""
+    bare = glass_frame._replace(reference=None)
+    found = examples.with_target(bare)
+    first, second = bare.halves()
+    np.testing.assert_array_equal(found.color, first.color)
+    np.testing.assert_allclose(found.reference.image, second.color, rtol=1e-6)
+    one = second.halves()[0].color
+    target, difference = found.reference
+    np.testing.assert_allclose(target + difference / 2, one, rtol=1e-5, atol=1e-6)
+    assert found.samples == glass_frame.samples / 2
+    assert examples.with_target(glass_frame) is glass_frame
+    holed = bare.buffers.color.at[2, 5, 5].set(jnp.nan)
+    holed = examples.with_target(
+        bare._replace(buffers=bare.buffers._replace(color=holed))
+    )
+    assert all(jnp.isfinite(each).all() for each in holed.reference)
+    folder = tmp_path / "own"
+    folder.mkdir()
+    for name in ("a", "b"):
+        exr.write_frame(folder / f"{name}-64.exr", bare)
+    card = train(folder, tmp_path / "run")
+    assert np.isfinite(card["validation"]["best"]["all"])
+    assert (tmp_path / "run" / "network.safetensors").exists()
 
 
 def test_validation_is_the_error_over_the_better_input(frames, tmp_path):

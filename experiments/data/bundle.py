@@ -1,10 +1,11 @@
 """Make the frames that come with the package, and the small ones that the tests use.
 
-Renders the glass scene with 64 and with 1024 samples a pixel and a reference of 32768,
+Renders the glass scene with 64, 256 and 1024 samples a pixel and a reference of 32768,
 and the plain scene with 64 and 4096, into the work folder (resumable, about 12 minutes
-on two cores with LLVM). Writes `jscomb/data/` with two sub-buffers, in 16 bits where no
-error is measured, and 64x64 crops with all four to `tests/data/`, beside small frames
-of random scenes of the test split of `experiments.data.dataset`, photon mapped too.
+on two cores with LLVM). Writes `jscomb/data/`: two frames with two sub-buffers, and a
+part of the third, for `jscomb demo`, with all four; in 16 bits where no error is
+measured. Writes 64x64 crops with all four to `tests/data/`, beside small frames of
+random scenes of the test split of `experiments.data.dataset`, photon mapped too.
 Crops are cut from frames that were denoised whole (`tests/data/README.md`).
 """
 
@@ -32,6 +33,7 @@ CROPS = {
     "cornell-box-64": BOX,
 }
 CROP = 64
+DEMO = (58, 36, 128)  # top, left and side: the boxes, the sphere and their floor
 UNSEEN = ("random-3001", "random-3004", "random-3007")  # no network is trained on them
 UNSEEN_SPP = (256, 16)  # the first brings the reference and the photon-mapped image
 
@@ -63,9 +65,11 @@ def run(config: Config) -> list[pathlib.Path]:
     config.work.mkdir(parents=True, exist_ok=True)
     of = functools.partial(Settings, size=config.size, buffers=config.buffers)
     glass = config.work / "cornell-glass-1024.exr"
+    shown = config.work / "cornell-glass-256.exr"
     recipes = {
         glass: (of(spp=1024, seed=10_000, reference_spp=32_768), None),
         config.work / "cornell-glass-64.exr": (of(spp=64), glass),
+        shown: (of(spp=256, seed=20_000), glass),
         config.work / "cornell-box-64.exr": (of(spp=64, reference_spp=4096), None),
     }
     written = []
@@ -76,7 +80,9 @@ def run(config: Config) -> list[pathlib.Path]:
         frame, provenance = exr.read_frame(out), exr.read_provenance(out)
         targets = {}
         if out.stem.startswith("cornell-glass"):
-            targets[ROOT / "jscomb" / "data" / out.name] = frame.merged(2)
+            # Of the demo's a part, with all sub-buffers.
+            part = crop(frame, *DEMO) if out == shown else frame.merged(2)
+            targets[ROOT / "jscomb" / "data" / out.name] = part
         if out.stem in CROPS:
             targets[ROOT / "tests" / "data" / out.name] = crop(frame, *CROPS[out.stem])
         for path, kept in targets.items():
@@ -116,9 +122,9 @@ def _write(path: pathlib.Path, frame: Frame, provenance: Any) -> pathlib.Path:
     return path
 
 
-def crop(frame: Frame, top: int, left: int) -> Frame:
-    """A square of `CROP` pixels of every image of a frame."""
-    rows, columns = slice(top, top + CROP), slice(left, left + CROP)
+def crop(frame: Frame, top: int, left: int, side: int = CROP) -> Frame:
+    """A square of some pixels of every image of a frame."""
+    rows, columns = slice(top, top + side), slice(left, left + side)
     return jax.tree.map(lambda a: a[..., rows, columns, :] if a.ndim > 2 else a, frame)
 
 

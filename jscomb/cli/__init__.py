@@ -11,6 +11,7 @@ import sys
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
+from jscomb import cache
 from jscomb.cli._interrupting import ends_on_interrupt
 
 if TYPE_CHECKING:
@@ -63,14 +64,12 @@ def __getattr__(name: str) -> Any:
 
 
 def _use_compilation_cache() -> None:
-    """Keep compiled programs in the user's cache, so the second run starts fast."""
-    import jax
+    """Keep compiled programs in the user's cache, so the second run starts fast.
 
-    from jscomb import cache
-
-    if jax.__version_info__ < (0, 10, 2):
-        return  # it would warn about every program that it finds there
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        programs = str(cache.folder() / "xla")
-        jax.config.update("jax_compilation_cache_dir", programs)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    JAX reads this when it is imported, in other processes too.
+    """
+    # JAX 0.10.1 complains about every program that it finds there, of a processor that
+    # lacks a preference of the compiler; all run.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache.folder() / "xla"))

@@ -13,8 +13,9 @@ import tyro
 
 from jscomb import methods, rendering
 from jscomb.cli._combining import combine
+from jscomb.cli._demo import demo
 from jscomb.cli._rendering import render
-from jscomb.cli._showing import demo, info
+from jscomb.cli._showing import info
 from jscomb.cli._training import train
 from jscomb.cli._viewing import compare, view
 

@@ -1,16 +1,10 @@
-"""`jscomb demo` and `info`."""
+"""`jscomb info`."""
 
-import functools
-import statistics
-import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from jscomb import exr, methods
+from jscomb import exr
 from jscomb.cli import _tables as tables
 from jscomb.cli._combining import (
     MAX_MEMORY,
@@ -19,57 +13,6 @@ from jscomb.cli._combining import (
     MaxMemory,
     SampleCount,
 )
-from jscomb.cli._making import by_tier
-from jscomb.denoisers import oidn
-from jscomb.frame import Frame
-from jscomb.typing import Image
-
-TIMED_RUNS = 7
-SHOWN = "denoised", "james-stein", "whitened", "njs", "pd", "dsc"
-TIERS = tuple(methods.TIERS)
-_DEMO_FOLDER = Path("jscomb-demo")
-
-
-def demo(*, out: Path = _DEMO_FOLDER) -> None:
-    """Combine the bundled frames and print the error of the combiners.
-
-    The frames are of one scene, path traced with 64 and with 1024 samples a pixel, and
-    denoised by Open Image Denoise.
-
-    Args:
-        out: folder for the pictures and the combined frames.
-    """
-    from jscomb import plots  # matplotlib is slow to import
-
-    out.mkdir(parents=True, exist_ok=True)
-    frames = {name: exr.read_frame(file) for name, file in exr.bundled().items()}
-    by_samples = sorted(frames.items(), key=lambda item: float(item[1].samples or 0))
-    table, shown, ms = {}, [], {}
-    for name, frame in by_samples:
-        spp = f"{float(frame.samples or 0):g} spp"
-        print(f"{spp}:")
-        combined, ms = _all_methods(frame)
-        for tier in TIERS:
-            start = time.perf_counter()  # of the second frame without compilation
-            made = by_tier(frame, tier)
-            combined[tier] = jax.block_until_ready(made.image)
-            ms[tier] = f"{1e3 * (time.perf_counter() - start):.0f}"
-            print(made.sentence(frame))
-        for method, image in combined.items():
-            exr.write_image(out / f"{name}-{method}.exr", image)
-        images = {"path tracing": frame.color, **combined}
-        errors, excluded = tables.errors(images, frame)
-        table[spp] = tables.rounded(errors)
-        if excluded:
-            print(excluded)
-        shown.append((frame, {TIERS[-1]: combined[TIERS[-1]]}))
-    size = tables.size(by_samples[0][1])
-    print(f"relative L2 of one scene, {size}, and the time of each step")
-    print(*tables.table({**table, "ms": ms}), sep="\n")
-    print("denoised is the image by Open Image Denoise, and its time.")
-    picture = out / "comparison.png"
-    plots.comparison(picture, shown)
-    print(f"wrote {picture} and the combinations as EXR to {out.resolve()}")
 
 
 def info(
@@ -177,35 +120,3 @@ def _print_range(name: str, buffer: Any) -> None:
         (good.min(), good.mean(), good.max()) if good.size else (np.nan,) * 3
     )
     print(f"  {name:<15} {low:10.4g} .. {high:<10.4g} mean {mean:.4g}")
-
-
-def _all_methods(frame: Frame) -> tuple[dict[str, Image], dict[str, str]]:
-    """Combinations of a denoised frame, and the milliseconds that each takes."""
-    images, ms = {}, {}
-    for method in SHOWN:
-        make = lambda frame, method=method: methods.plan(
-            jax.random.key(0), frame, method=method, biased=None
-        ).whole()
-        try:
-            images[method], time_of_one = _timed(make, frame)
-        except ImportError as error:
-            print(f"{method}: skipped: {error}")
-            continue
-        ms[method] = f"{time_of_one:.1f}"
-    ms["denoised"] = ""  # its time is the denoiser's, where that is installed
-    if oidn.available():
-        guides = {"albedo": frame.albedo, "normal": frame.normal}
-        denoise = functools.partial(oidn.denoise, **guides)
-        ms["denoised"] = f"{_timed(denoise, frame.color)[1]:.1f}"
-    return images, ms
-
-
-def _timed(function: Callable, *inputs: Any) -> tuple[Image, float]:
-    """A result, and the median milliseconds of making it again."""
-    result = jax.block_until_ready(function(*inputs))
-    times = []
-    for _ in range(TIMED_RUNS):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*inputs))
-        times.append(1e3 * (time.perf_counter() - start))
-    return result, statistics.median(times)

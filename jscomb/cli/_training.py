@@ -79,11 +79,12 @@ def train(
     rate: float = Run.rate,
     seed: int = Run.seed,
 ) -> None:
-    """Train a method's network on frames with references; resumes if interrupted.
+    """Train a method's network on frames; resumes if interrupted.
 
-    FOLDER holds frames (EXR, as `jscomb render --reference-spp` writes) or, apart, the
-    folders `train` and `validate`. OUT gets the network of the step that is best on the
-    frames it is not trained on, its card, the losses and a plot of them.
+    FOLDER holds frames (EXR) with references, as `jscomb render --reference-spp` writes
+    them, or with four sub-buffers, of which two are then the target of the other two;
+    or, apart, the folders `train` and `validate`. OUT gets the network of the step that
+    is best on the frames it is not trained on, its card, the losses and their plot.
 
     Args:
         method: njs, dsc, dsc-photons, pd, neural-ensemble, kernels (a denoiser) or
@@ -144,6 +145,9 @@ def train_files(
     files, held_files = split_files(data, validation)
     about = _about(run, recipe, files, held_files)
     card = _resume(out, about)
+    if not card:
+        for each in (files, held_files):
+            check_files(each, piece=run.piece)
     out.mkdir(parents=True, exist_ok=True)
     made = functools.partial(prepare, recipe, cache=out / "inputs", piece=run.piece)
     held, drawn = made(held_files, variants=False), made(files).examples
@@ -267,7 +271,7 @@ def prepare(
         if not kept.exists():
             frame = exr.read_frame(file)
             try:
-                frame = with_bases(recipe, frame)
+                frame = with_bases(recipe, examples.with_target(frame))
                 made: Any = examples.make_inputs(recipe, frame, variants=variants)
             except ValueError as error:
                 raise ValueError(f"{file}: {error}") from None
@@ -279,6 +283,32 @@ def prepare(
     if not found:
         raise ValueError(f"no frame of {piece} x {piece} pixels or more with light")
     return examples.stack_examples(found)
+
+
+def check_files(files: Sequence[pathlib.Path], *, piece: int = 1) -> None:
+    """Raise if frames cannot be trained on, before anything is computed.
+
+    Args:
+        files: of frames.
+        piece: width and height in pixels that one of them must have.
+
+    Raises:
+        ValueError: if one has no target, or all are too small; names the file.
+    """
+    from jscomb.learning import examples
+
+    largest = 0
+    for file in tqdm(files, unit="frame", desc="check", leave=False, disable=None):
+        try:
+            frame = examples.with_target(exr.read_frame(file))
+        except ValueError as error:
+            named = str(error).startswith(str(file))
+            raise ValueError(str(error) if named else f"{file}: {error}") from None
+        largest = max(largest, min(frame.color.shape[:2]))
+    if largest < piece:
+        raise ValueError(
+            f"{files[0].parent}: no frame of {piece}x{piece} pixels or more (--crop)"
+        )
 
 
 def with_bases(recipe: "Recipe", frame: Frame) -> Frame:

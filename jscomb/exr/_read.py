@@ -17,12 +17,13 @@ def bundled() -> dict[str, pathlib.Path]:
 
     Returns:
         files by name: cornell-glass-64 and cornell-glass-1024, one scene path traced
-        with 64 and with 1024 samples a pixel, denoised, with features and a reference.
+        with 64 and with 1024 samples a pixel, denoised, with features and a reference;
+        and cornell-glass-256, a part of it in four sub-buffers.
 
     Example:
         >>> from jscomb import exr
         >>> print(sorted(exr.bundled()))
-        ['cornell-glass-1024', 'cornell-glass-64']
+        ['cornell-glass-1024', 'cornell-glass-256', 'cornell-glass-64']
     """
     folder = importlib.resources.files("jscomb") / "data"
     files = [pathlib.Path(str(file)) for file in folder.iterdir()]

@@ -15,10 +15,12 @@ from jaxtyping import Array, Float
 
 from jscomb import metrics
 from jscomb.denoisers import oidn
-from jscomb.frame import Estimate, Frame
+from jscomb.frame import Estimate, Frame, Reference
 from jscomb.learning import recipes, training
 from jscomb.learning.recipes import Inputs, Network, Recipe
-from jscomb.typing import Image, Scalar
+from jscomb.numerics.guards import finite, weighted_ratio
+from jscomb.numerics.windows import window_mean
+from jscomb.typing import Image, Mask, Scalar
 
 __all__ = [
     "Judged",
@@ -30,9 +32,11 @@ __all__ = [
     "stack_examples",
     "summary",
     "validate",
+    "with_target",
 ]
 
 _COMBINED = "unbiased", "biased", "biased_a", "noisy", "base"  # among the inputs
+_AROUND = 7  # width of the window in which an invalid target is replaced
 _LEAST = 0.02  # of the better input's error: less is not known from noisy references
 
 Arrays = Mapping[str, np.ndarray]
@@ -59,8 +63,8 @@ def make_inputs(
 
     Args:
         recipe: of the network.
-        frame: with a reference with halves; with the recipe's bases and estimate,
-            unless that is oidn, which is made where it is missing.
+        frame: as of `with_target`; with the recipe's bases and estimate, unless that
+            is oidn, which is made where it is missing.
         variants: all of the recipe's inputs, not only the first.
 
     Returns:
@@ -79,8 +83,8 @@ def make_inputs(
         >>> print(found["depth"].shape, found["halves"].shape)
         (1, 192, 192, 1) (2, 192, 192, 3)
     """
-    if frame.reference is None or frame.reference.half_difference is None:
-        raise ValueError("training needs a reference with halves")
+    frame = with_target(frame)
+    assert frame.reference is not None
     if not float(jnp.median(frame.reference.image)) > 0:
         return {}
     if lacking := set(recipe.bases) - set(frame.estimates):
@@ -103,6 +107,52 @@ def make_inputs(
         "better": np.asarray(jnp.maximum(jnp.stack(better), noise)),
         "samples": np.asarray(frame.samples or 0),
     }
+
+
+def with_target(frame: Frame) -> Frame:
+    """Return a frame with a reference to train on, noise to noise where it has none.
+
+    Without one, half of the samples are the reference of the other half, from which
+    they are independent: in expectation the loss has the same minimum.
+
+    Args:
+        frame: with a reference with halves, or with four sub-buffers.
+
+    Returns:
+        the frame, or its first half, without Open Image Denoise's estimate where that
+        can be made anew.
+
+    Raises:
+        ValueError: if it has neither.
+
+    Example:
+        >>> from jscomb.frame import make_frame
+        >>> frame = with_target(make_frame(jnp.ones((4, 8, 8, 3))))
+        >>> print(frame.sub_buffers, frame.reference.image.shape)
+        2 (8, 8, 3)
+    """
+    if frame.reference is not None and frame.reference.half_difference is not None:
+        return frame
+    if frame.sub_buffers < 4:
+        raise ValueError(
+            "training needs a reference with halves, or at least four sub-buffers "
+            f"(this frame has {frame.sub_buffers})"
+        )
+    seen, other = frame.halves()
+    a, b = (half.color for half in other.halves())
+    a, b = (_filled(half, finite(a, b)) for half in (a, b))
+    estimates = dict(seen.estimates)
+    if oidn.available():  # its halves, too
+        estimates.pop("oidn", None)
+    return seen._replace(estimates=estimates, reference=Reference((a + b) / 2, a - b))
+
+
+def _filled(image: Image, valid: Mask) -> Image:
+    """Invalid pixels by the mean of valid ones around them, or by black."""
+    weight = valid.astype(image.dtype)
+    shown = jnp.where(valid, image, 0.0)
+    around = weighted_ratio(window_mean(shown, _AROUND), window_mean(weight, _AROUND))
+    return jnp.where(valid, image, around)
 
 
 def pieces(arrays: Arrays, size: int) -> list[Arrays]:

@@ -67,7 +67,8 @@ def _unfit(name: str, frame: Frame) -> str:
     if not missing and method.takes == "one estimate":
         wanted = method.input or _DENOISER
         held = frame.estimates.get(wanted)
-        if held is None or held.halves is None:
+        of_halves = method.needs.halves and wanted in METHODS  # made anew of each half
+        if held is None or held.halves is None or of_halves:
             missing = _missing_input(wanted, frame)
     return f"needs {missing}" if missing else ""
 
