@@ -424,6 +424,10 @@ def test_info_says_what_was_taken_for_what(jscomb, here):
 # Ctrl-C
 
 
+@pytest.mark.skipif(
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN,
+    reason="a shell's background job, and what it starts, ignores Ctrl-C",
+)
 @pytest.mark.parametrize("seconds", [0.3, 6.0])
 def test_an_interrupted_command_ends_at_once(seconds, here):
     """While it is imported, and at work; nothing is left half written."""
