@@ -141,7 +141,7 @@ def joint_local_linear(
     stride: int = 1,
     ridge: Float[Array, " f"] | float = 0.1,
     scale_floor: float = 0.1,
-) -> tuple[LocalFit, ...]:
+) -> tuple:
     """Fit one linear model to several targets, each with its own weights.
 
     Minimises the sum of their squared errors, whose normal equations are the sum of
