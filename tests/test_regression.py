@@ -173,6 +173,11 @@ def test_powers_are_bandwidths(rng):
         expected = oracle([(t, gaussian(g, 0.4 / power))], features, window=9)
         assert errors(found, expected).max() < 1e-10
         np.testing.assert_allclose(found.weight[..., 0], expected[1], rtol=1e-10)
+    t, g, features = map(jnp.asarray, (t, g, features))
+    with pytest.raises(ValueError, match="powers must be positive"):
+        joint_local_linear(
+            [(t, gaussian_weights(g, 0.4))], features, powers=(1, 0), window=9
+        )
 
 
 def hard_cases():

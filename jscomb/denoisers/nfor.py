@@ -71,8 +71,8 @@ def denoise(
 ) -> tuple[Image, Image]:
     """Denoise both halves, each with the other's weights and features.
 
-    Pure, differentiable in every array, and scale-equivariant. The weights of both
-    strengths are computed once, and take half of the time.
+    Pure, differentiable in every array, and scale-equivariant. The weights of one
+    strength are a power of the other's, and are computed once.
 
     Args:
         unbiased_a: x_a, radiance, shape [H,W,C].

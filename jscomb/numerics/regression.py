@@ -160,10 +160,10 @@ def joint_local_linear(
         scale_floor: > 0, unit of the features.
 
     Returns:
-        the predictions and their weights, for each power.
+        a `LocalFit` for each power, in their order.
 
     Raises:
-        ValueError: while tracing, as `local_linear`.
+        ValueError: while tracing, as `local_linear`, or if a power is not positive.
 
     Example:
         >>> depth = jnp.arange(12.0).reshape(3, 4, 1)
@@ -179,6 +179,8 @@ def joint_local_linear(
     similarity = [weights for _, weights in targets]
     similarity += [] if predict is None else [predict]
     _check(targets, features, similarity, ridge, scale_floor)
+    if not powers or not min(powers) > 0:
+        raise ValueError(f"powers must be positive, got {powers}")
     count = len(targets)
     valid, clean, *images = zero_invalid(
         features, *(image for image, _ in targets), *(s.image for s in similarity)
