@@ -49,10 +49,24 @@ def main(
     options, found = _called(config, name, doc, lambda options: report(run(options)))
     print(f"{found.answer}\n\n{found.body}")
     if options.report is not None:
-        # Whose folder it was is nobody's business: absolute paths by their names.
-        words = [pathlib.Path(w).name if w[0:1] == "/" else w for w in sys.argv[1:]]
-        command = shlex.join(["python", "-m", name, *words])
+        command = shlex.join(["python", "-m", name, *_without_folders(sys.argv[1:])])
         write(options.report, name, doc, command, found)
+
+
+def _without_folders(words: list[str]) -> list[str]:
+    """Absolute paths by their names, or whose folder it was would be told.
+
+    The folder's name stays where two paths have one name.
+    """
+    names = [pathlib.Path(word).name for word in words]
+
+    def shown(word: str, name: str) -> str:
+        if not word.startswith("/"):
+            return word
+        parts = 2 if names.count(name) > 1 else 1
+        return "/".join(pathlib.Path(word).parts[-parts:])
+
+    return [shown(*each) for each in zip(words, names, strict=True)]
 
 
 def tool(config: type, run: Callable[[Any], object]) -> None:

@@ -224,7 +224,7 @@ def report(found: Found) -> Report:
         body.append(table([f"{scene}: error / path tracing", "slope", *counts], rows))
     tracing = [slope(*each["path tracing"]) for each in found.curves.values()]
     answer = (
-        f"{found.config.metric} falls as samples to the power of "
+        f"The {found.config.metric} falls as samples to the power of "
         f"{np.mean(tracing):.2f} for path tracing, {min(slopes):.2f} to "
         f"{max(slopes):.2f} for what combines; of "
         f"{len(slopes)} combiners and scenes {below} stay below path tracing at every "
