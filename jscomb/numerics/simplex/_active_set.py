@@ -6,8 +6,11 @@ freed. The function never rises, so no set is visited twice and the search ends,
 latest where rounding fixes a weight that was just freed.
 """
 
-from collections.abc import Callable
+import functools
+import operator
+from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -38,6 +41,51 @@ def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
 
     each = lax.map(lambda piece: function(*piece), tuple(map(pieces_of, arrays)))
     return jnp.moveaxis(each, 0, 1).reshape(each.shape[1], -1)[:, :count]
+
+
+def solve_where(
+    needed: Bool[Array, " m"], solve: Callable[..., Flat], w: Flat, *arrays: Array
+) -> Flat:
+    """Return the weights w, solved anew where it is needed.
+
+    The needed problems are packed into blocks, so that the others do not wait for them.
+    Few take an eighth of the memory of many.
+
+    Args:
+        needed: problems to solve, shape [M].
+        solve: of arrays and weights of some thousand problems, the weights.
+        w: the weights of the others, shape [N,M].
+        arrays: what defines the problems, M on the last axis.
+    """
+    count = len(needed)
+    place = jnp.cumsum(needed, dtype=jnp.int32)  # of the needed ones, from 1
+    needs = place[-1]
+    block = min(_CHUNK, count)
+
+    def with_room_for(most: int) -> Callable[..., Flat]:
+        room = -(-most // block) * block
+
+        def packed(array: Array, index: Array) -> Array:
+            some = jnp.take(array, index, axis=-1, mode="clip")
+            return jnp.moveaxis(some.reshape(*some.shape[:-1], -1, block), -2, 0)
+
+        def solved(piece: tuple) -> Flat:
+            first, *some = piece
+            return lax.cond(first < needs, solve, lambda *some: some[-1], *some)
+
+        @jax.checkpoint  # or what a derivative needs were kept of both sizes
+        def solve_all(w: Flat, *arrays: Array) -> Flat:
+            nth = jnp.arange(room, dtype=jnp.int32)
+            index = jnp.searchsorted(place, nth + 1)  # beyond the last problem: dropped
+            pieces = [packed(array, index) for array in (*arrays, w)]
+            each = lax.map(solved, (nth[::block], *pieces))
+            flat = jnp.moveaxis(each, 0, 1).reshape(len(w), -1)
+            return w.at[:, index].set(flat, mode="drop", unique_indices=True)
+
+        return solve_all
+
+    few = -(-count // 8)
+    return lax.cond(needs <= few, with_room_for(few), with_room_for(count), w, *arrays)
 
 
 def minimum_weight(w: Flat) -> float:
@@ -108,7 +156,14 @@ def search(
     return w, free
 
 
-def shared_by_equals(w: Flat, equal: Bool[Array, "n n m"]) -> Flat:
+def shared_by_equals(
+    w: Sequence[Float[Array, " m"]], equal: Sequence[Sequence[Bool[Array, " m"]]]
+) -> Flat:
     """Return weights averaged over equal bases; each equals itself."""
-    count = jnp.sum(equal, axis=1).astype(w.dtype)
-    return jnp.sum(jnp.where(equal, w[None], 0.0), axis=1) / count
+
+    def mean(equal_to: Sequence[Array]) -> Array:
+        count = functools.reduce(operator.add, [s.astype(w[0].dtype) for s in equal_to])
+        own = [jnp.where(*each, 0.0) for each in zip(equal_to, w, strict=True)]
+        return functools.reduce(operator.add, own) / count
+
+    return jnp.stack([mean(equal_to) for equal_to in equal])

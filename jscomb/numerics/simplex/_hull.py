@@ -1,25 +1,38 @@
 """The exact solver in the plane, where every base is a point of two halves."""
 
+import functools
 import itertools
+import operator
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from jscomb.numerics import cholesky
 from jscomb.numerics.guards import divide, safe_sqrt
 from jscomb.numerics.simplex._active_set import (
     Flat,
-    in_chunks,
     search,
     shared_by_equals,
+    solve_where,
 )
+from jscomb.numerics.simplex._plane import (
+    Point,
+    Points,
+    Targets,
+    Weights,
+    coordinates,
+    cross,
+    segment,
+    share_of,
+    stacked,
+)
+from jscomb.numerics.tiles import in_one_pass
 
-Points = Float[Array, "n *batch"]
-Targets = Float[Array, " *batch"]
-Weights = Float[Array, "n *batch"]
 Pair = Float[Array, "2 *batch"]  # points or weights of two bases
-Plane = Float[Array, "2 m"]  # a point of the plane for each problem
+Plane = Float[Array, "n 2 m"]  # the points of N bases
+Pairs = UInt32[Array, " m"]  # two of N bases, i * N + j
 
 
 def two(points_a: Pair, points_b: Pair, target_a: Targets, target_b: Targets) -> Pair:
@@ -47,8 +60,8 @@ def two(points_a: Pair, points_b: Pair, target_a: Targets, target_b: Targets) ->
     """
     if len(points_a) != 2:
         raise ValueError(f"two takes 2 bases, got {len(points_a)}")
-    u, c = plane(points_a, points_b, target_a, target_b)
-    share = share_of(u[0], u[1], c)
+    (first, second), c = coordinates(points_a, points_b, target_a, target_b)
+    share = share_of(first, second, c)
     return jnp.stack([1 - share, share]).reshape(points_a.shape)
 
 
@@ -82,129 +95,125 @@ def hull(
 
     Source: ours, for the objective of ED eq. 14.
     """
-    u, c = plane(points_a, points_b, target_a, target_b)
+    u, c = coordinates(points_a, points_b, target_a, target_b)
     if len(u) == 1:
         return jnp.ones_like(points_a)
-    return in_chunks(_nearest, u, c).reshape(points_a.shape)
-
-
-def _nearest(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
-    """Weights of the point of the hull that is nearest to the target."""
-    w, minimum = _nearest_edge(u, c)
+    pair, surrounded = in_one_pass(_nearest, u, c)
+    share = in_one_pass(_share, u, c, pair)
+    w = in_one_pass(_blend, u, pair, share)
     if len(u) > 2:
-        around = _fan_triangle(u, c)
-        found = jnp.sum(around, axis=0) > 0
-        excess = _excess(jnp.sum(around[:, None] * u, axis=0), c)
-        # Also where a segment inside the hull hits the target.
-        rounding = 8 * float(jnp.finfo(u.dtype).eps) * (1 + jnp.sum(jnp.abs(c), axis=0))
-        inside = found & (excess <= minimum + rounding)
-        if len(u) > 3:
-            around = _nearest_uniform(u, c, around, inside)
-        w = jnp.where(inside[None], around, w)
-    return shared_by_equals(w, jnp.all(u[:, None] == u[None], axis=2))
+        w = solve_where(surrounded, _inside, w, stacked(u), jnp.stack(c))
+    return w.reshape(points_a.shape)
 
 
-def plane(
-    points_a: Points, points_b: Points, target_a: Targets, target_b: Targets
-) -> tuple[Float[Array, "n 2 m"], Plane]:
-    """Return u_i = p_i - mean [N,2,M] and c = mean - t [2,M], divided by the largest u.
+def _nearest(u: Sequence[Point], c: Point) -> tuple[Pairs, Bool[Array, " m"]]:
+    """The pair whose segment comes nearest; whether the hull may surround the target.
 
-    The target may be a firefly, far from all points, and must not round differences of
-    points. Both are 0 in problems with a number that is not finite.
+    It does not surround a target from which all other points are to the left of one.
     """
-    n, *batch = points_a.shape
-    if n == 0:
-        raise ValueError("an ensemble needs at least one base, got 0")
-    for name, array, shape in (
-        ("points_b", points_b, points_a.shape),
-        ("target_a", target_a, tuple(batch)),
-        ("target_b", target_b, tuple(batch)),
-    ):
-        if array.shape != shape:
-            raise ValueError(
-                f"{name} has shape {array.shape}, expected {shape}: points_a has "
-                f"{points_a.shape}"
-            )
-    p = jnp.stack([points_a, points_b], axis=1).reshape(n, 2, -1)
-    t = jnp.stack([target_b, target_a]).reshape(2, -1)
-    known = jnp.all(jnp.isfinite(p), axis=(0, 1)) & jnp.all(jnp.isfinite(t), axis=0)
-    p, t = jnp.where(known[None, None], p, 0.0), jnp.where(known[None], t, 0.0)
-    u = p - p[:1]  # exactly 0 where all points are the same, unlike p - mean
-    offset = jnp.mean(u, axis=0)
-    u = u - offset[None]
-    size = jnp.max(jnp.abs(lax.stop_gradient(u)), axis=(0, 1))
-    scale = divide(jnp.ones_like(size), size, where=size > 0, otherwise=1.0)
-    return u * scale[None, None], (p[0] - t + offset) * scale[None]
-
-
-def share_of(first: Plane, second: Plane, c: Plane) -> Float[Array, " m"]:
-    """Return the share of the second end at the point of a segment nearest to -c.
-
-    One half if both ends are equal. Source: ED eq. 29.
-    """
-    d = second - first
-    square = jnp.sum(d * d, axis=0)
-    along = -jnp.sum((first + c) * d, axis=0)
-    return share_within(along, square, 0.5)
-
-
-def share_within(
-    along: Float[Array, " m"], square: Float[Array, " m"], otherwise: float
-) -> Float[Array, " m"]:
-    """Return along / square between 0 and 1; `otherwise` where the square is 0.
-
-    The ends have no derivative: that of a huge quotient would not be finite.
-    """
-    inside = (along > 0) & (along < square)
-    share = divide(along, square, where=inside)
-    end = jnp.where(square > 0, jnp.where(along > 0, 1.0, 0.0), otherwise)
-    return jnp.where(inside, share, end.astype(share.dtype))
-
-
-def _excess(z: Plane, c: Plane) -> Float[Array, " m"]:
-    """|z + c|^2 - |c|^2, precise for a far target; without derivatives."""
-    return lax.stop_gradient(jnp.sum(z * (z + 2 * c), axis=0))
-
-
-def _nearest_edge(
-    u: Float[Array, "n 2 m"], c: Plane
-) -> tuple[Flat, Float[Array, " m"]]:
-    """Weights of the point nearest to the target on all pairs' segments; its excess."""
-    n, _, m = u.shape
-    minimum = jnp.full(m, jnp.inf, u.dtype)
-    share = jnp.zeros_like(minimum)
-    first = second = jnp.zeros(m, int)
+    n, (u, c) = len(u), lax.stop_gradient((u, c))
+    distance = _distance_to(c)
+    least, pair = jnp.full_like(c[0], jnp.inf), jnp.zeros(c[0].shape, jnp.uint32)
+    differ, rightmost = jnp.zeros(pair.shape, bool), [jnp.ones(pair.shape, bool)] * n
     for i, j in itertools.combinations(range(n), 2):
-        s = share_of(u[i], u[j], c)
-        excess = _excess(u[i] + s[None] * (u[j] - u[i]), c)
-        better = excess < minimum
-        minimum = jnp.where(better, excess, minimum)
-        share = jnp.where(better, s, share)
-        first, second = (
-            jnp.where(better, k, old) for k, old in ((i, first), (j, second))
+        along, square = segment(u[i], u[j], c)
+        share = jnp.clip(along / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
+        x, y = (
+            start + share * (end - start) for start, end in zip(u[i], u[j], strict=True)
         )
-    number = jnp.arange(n)[:, None]
-    w = jnp.where(number == second[None], share[None], 0.0)
-    return jnp.where(number == first[None], 1 - share[None], w), minimum
+        of_pair = distance(x, y)
+        nearer = of_pair < least
+        least = jnp.where(nearer, of_pair, least)
+        pair = jnp.where(nearer, jnp.uint32(i * n + j), pair)
+        turn = cross(u[i], u[j], c)
+        rightmost[i] &= turn > 0
+        rightmost[j] &= turn < 0
+        differ |= square > 0
+    return pair, differ & ~functools.reduce(operator.or_, rightmost)
 
 
-def _fan_triangle(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
+def _distance_to(c: Point) -> Callable[[Array, Array], Float[Array, " m"]]:
+    """The squared distance of a point z from -c; of a far target what exceeds |c|^2.
+
+    So that a small distance is precise, and a far target does not round those of points
+    against each other: |z + c|^2 = (z + c).(z + c) or z.(z + 2 c) + |c|^2.
+    """
+    far = jnp.abs(c[0]) + jnp.abs(c[1]) > 4
+    of_one, of_other = jnp.where(far, 0.0, 1.0), jnp.where(far, 2.0, 1.0)
+
+    def distance(x: Array, y: Array) -> Array:
+        of_x = (x + of_one * c[0]) * (x + of_other * c[0])
+        return of_x + (y + of_one * c[1]) * (y + of_other * c[1])
+
+    return distance
+
+
+def _share(u: Sequence[Point], c: Point, pair: Pairs) -> Float[Array, " m"]:
+    """The share of a pair's second base at the point that is nearest to the target."""
+
+    def at(end: Array) -> Point:
+        x, y = jnp.zeros_like(c[0]), jnp.zeros_like(c[1])
+        for i, point in enumerate(u):
+            x, y = (
+                jnp.where(end == i, *each) for each in zip(point, (x, y), strict=True)
+            )
+        return x, y
+
+    return share_of(at(pair // len(u)), at(pair % len(u)), c)
+
+
+def _blend(u: Sequence[Point], pair: Pairs, share: Float[Array, " m"]) -> Flat:
+    """The weights of all bases where a pair's second one has a share."""
+    first, second = pair // len(u), pair % len(u)
+    w = [
+        jnp.where(first == i, 1 - share, jnp.where(second == i, share, 0.0))
+        for i in range(len(u))
+    ]
+    return _shared_by_equals(w, u)
+
+
+def _inside(u: Plane, c: Float[Array, "2 m"], w: Flat) -> Flat:
+    """Weights that reach a target inside the hull; w where it is not."""
+    around = _fan_triangle(u, c)
+    found = jnp.sum(around, axis=0) > 0
+    fixed = lax.stop_gradient((u, c, around, w))
+    # Also where a segment inside the hull hits the target.
+    inside = found & ~_farther(*fixed)
+    if len(u) > 3:
+        around = _nearest_uniform(u, c, around, inside)
+    around = _shared_by_equals(jnp.unstack(around), jnp.unstack(u))
+    return jnp.where(inside[None], around, w)
+
+
+def _farther(
+    u: Plane, c: Float[Array, "2 m"], w: Flat, than: Flat
+) -> Bool[Array, " m"]:
+    """Whether weights are farther from the target than others, beyond rounding."""
+    distance = _distance_to(c)
+    of_w, of_others = (
+        distance(*jnp.sum(each[:, None] * u, axis=0)) for each in (w, than)
+    )
+    rounding = 8 * float(jnp.finfo(u.dtype).eps) * (1 + jnp.sum(jnp.abs(c), axis=0))
+    return of_w > of_others + rounding
+
+
+def _shared_by_equals(w: Sequence[Array], points: Sequence[Point]) -> Flat:
+    """The weights averaged over bases at the same point."""
+    same = [[(p[0] == q[0]) & (p[1] == q[1]) for q in points] for p in points]
+    return shared_by_equals(w, same)
+
+
+def _fan_triangle(u: Plane, c: Point) -> Flat:
     """Weights of a triangle around the target, of sum one; 0 where there is none.
 
     Triangles of the first point and any two others cover the hull. The largest one
     around the target rounds least.
     """
     n, _, m = u.shape
-
-    def cross(i: int, j: int) -> Array:
-        """Cross product of p_i and p_j, p = u + c, where c may be large."""
-        d = u[j] - u[i]
-        return u[i, 0] * d[1] - u[i, 1] * d[0] + c[0] * d[1] - c[1] * d[0]
-
-    with_first = [cross(0, j) for j in range(n)]
+    with_first = [cross(u[0], u[j], c) for j in range(n)]
     largest, w = jnp.zeros(m, u.dtype), jnp.zeros((n, m), u.dtype)
     for j, k in itertools.combinations(range(1, n), 2):
-        corners = {0: cross(j, k), j: -with_first[k], k: with_first[j]}
+        corners = {0: cross(u[j], u[k], c), j: -with_first[k], k: with_first[j]}
         area = sum(corners.values())
         sign = jnp.sign(area)
         around = jnp.stack([sign * corner >= 0 for corner in corners.values()])
@@ -218,7 +227,7 @@ def _fan_triangle(u: Float[Array, "n 2 m"], c: Plane) -> Flat:
 
 
 def _nearest_uniform(
-    u: Float[Array, "n 2 m"], c: Plane, start: Flat, inside: Bool[Array, " m"]
+    u: Plane, c: Point, start: Flat, inside: Bool[Array, " m"]
 ) -> Flat:
     """The weights of minimum |w|^2 that reach a target inside the hull.
 
@@ -254,7 +263,7 @@ def _nearest_uniform(
 
 
 def _orthonormal(
-    u: Float[Array, "n 2 m"], c: Plane
+    u: Plane, c: Point
 ) -> tuple[Float[Array, "3 n m"], Float[Array, "3 m"]]:
     """Ones and both coordinates of the points as orthonormal rows; the target in them.
 

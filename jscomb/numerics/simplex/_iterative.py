@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.simplex._active_set import Flat
-from jscomb.numerics.simplex._hull import Points, Targets, Weights, plane, share_of
+from jscomb.numerics.simplex._plane import Points, Targets, Weights, plane, share_of
 from jscomb.numerics.simplex._quadratic import Matrix, objective_of, share_along
 from jscomb.typing import Key
 

@@ -17,7 +17,7 @@ from jscomb.numerics.simplex._active_set import (
     shared_by_equals,
     sums_to_one,
 )
-from jscomb.numerics.simplex._hull import share_within
+from jscomb.numerics.simplex._plane import share_within
 
 _LARGEST = 1e3  # affine weight: beyond, more is lost to rounding than gained
 
@@ -73,7 +73,7 @@ def _solve(matrix: Float[Array, "n n m"]) -> Flat:
     w, _ = _minimum(objective, jnp.where(solved[None], free, start))
     feasible = jnp.all(w >= minimum_weight(w), axis=0)
     w = jnp.where(feasible[None], jnp.maximum(w, 0.0), found)
-    w = shared_by_equals(w, jnp.all(matrix[:, None] == matrix[None], axis=2))
+    w = _shared_by_equals(w, matrix)
     return w / jnp.sum(w, axis=0, keepdims=True)
 
 
@@ -127,7 +127,13 @@ def _solve_affine(matrix: Float[Array, "n n m"]) -> Flat:
     )
     alone = start.astype(w.dtype)
     w = alone + share[None] * (w - alone)
-    return shared_by_equals(w, jnp.all(matrix[:, None] == matrix[None], axis=2))
+    return _shared_by_equals(w, matrix)
+
+
+def _shared_by_equals(w: Flat, matrix: Float[Array, "n n m"]) -> Flat:
+    """The weights averaged over bases of equal rows."""
+    equal = jnp.all(matrix[:, None] == matrix[None], axis=2)
+    return shared_by_equals(jnp.unstack(w), [jnp.unstack(row) for row in equal])
 
 
 class Objective(NamedTuple):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jscomb.numerics.simplex._hull import Points, Targets, Weights, plane
+from jscomb.numerics.simplex._plane import Points, Targets, Weights, plane
 from jscomb.numerics.simplex._quadratic import Matrix, objective_of
 
 

@@ -20,7 +20,7 @@ from jscomb.numerics.tiles._neighbourhoods import (
     sum_over_tiles,
 )
 from jscomb.numerics.tiles._plans import network_plan
-from jscomb.numerics.tiles._programs import compiled
+from jscomb.numerics.tiles._programs import compiled, in_one_pass
 
 __all__ = [
     "Crop",
@@ -33,6 +33,7 @@ __all__ = [
     "crops",
     "flat",
     "fold_rows",
+    "in_one_pass",
     "map_crops",
     "map_rows",
     "map_shards",

@@ -5,6 +5,8 @@ from collections.abc import Callable, Hashable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax import lax
 
 
 def compiled(function: Callable[..., Any], **static: Hashable) -> Callable[..., Any]:
@@ -34,3 +36,29 @@ def compiled(function: Callable[..., Any], **static: Hashable) -> Callable[..., 
 def _compiled(function: Callable[..., Any], *static: tuple[str, Hashable]) -> Callable:
     """Compile; options in one order, so that equal ones share a program."""
     return jax.jit(functools.partial(function, **dict(static)))
+
+
+def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return function(*arguments), computed from arrays in memory, in loops of its own.
+
+    XLA fuses what makes an array into every loop that reads it, so that it is computed
+    anew for each of N results.
+
+    Args:
+        function: of the arguments; elementwise, or there is nothing to gain.
+        arguments: trees of arrays; the first element of the first one is finite.
+
+    Returns:
+        what the function returns.
+
+    Example:
+        >>> print(in_one_pass(lambda x: (x, 2 * x), jnp.ones(1))[1])
+        [2.]
+    """
+    like = jax.eval_shape(function, *arguments)
+    never = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    first = jax.tree.leaves(arguments)[0].ravel()
+    # A branch that is always taken, which the compiler cannot know: nothing is fused
+    # across it. It removes `lax.optimization_barrier` on CPUs.
+    taken = jnp.all(jnp.isfinite(first[:1]))
+    return lax.cond(taken, function, never, *arguments)
