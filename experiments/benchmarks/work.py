@@ -77,7 +77,7 @@ def _count(jaxpr: core.Jaxpr) -> Work:
     """All equations."""
     total = Work()
     for equation in jaxpr.eqns:
-        inner = [_count(each) for each in _inside(equation)]
+        inner = [_count(each) for each in inside(equation)]
         if equation.primitive.name == "cond":
             inner = [max(inner, key=sum)]
         for each in inner:
@@ -87,8 +87,8 @@ def _count(jaxpr: core.Jaxpr) -> Work:
     return total
 
 
-def _inside(equation: core.JaxprEqn) -> list[core.Jaxpr]:
-    """The programs that an equation runs."""
+def inside(equation: core.JaxprEqn) -> list[core.Jaxpr]:
+    """Return the programs that an equation runs."""
     if equation.primitive.name.startswith(("reduce", "scatter", "cum", "sort", "arg")):
         return []  # what it does to two numbers
     found = []

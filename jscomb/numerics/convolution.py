@@ -124,9 +124,7 @@ def _convolve_jvp(rows: int, primals, tangents) -> tuple[Array, Array]:
     if not isinstance(image_dot, SymbolicZero):
         terms.append(_by_xla(image_dot, kernel, rows))
     if not isinstance(kernel_dot, SymbolicZero):
-        whole = 0 < rows == kernel.shape[0] // 2
-        by = _by_groups if whole else _by_patches
-        terms.append(by(image, kernel_dot, rows))
+        terms.append(_in_kernel(image, kernel_dot, rows))
     return result, sum(terms, start=jnp.zeros_like(result))
 
 
@@ -159,8 +157,16 @@ def _convolve_doubled_jvp(primals, tangents) -> tuple[Array, Array]:
     if not isinstance(image_dot, SymbolicZero):
         terms.append(_convolve_doubled(image_dot, kernel))
     if not isinstance(kernel_dot, SymbolicZero):
-        terms.append(_by_groups(doubled(image), kernel_dot, 1))
+        terms.append(_in_kernel(doubled(image), kernel_dot, 1))
     return result, sum(terms, start=jnp.zeros_like(result))
+
+
+def _in_kernel(image: Array, kernel_dot: Array, rows: int) -> Array:
+    """The derivative's term in the kernel, in the form of the fastest transpose."""
+    if jax.default_backend() != "cpu":
+        return _by_xla(image, kernel_dot, rows)
+    whole = 0 < rows == kernel_dot.shape[0] // 2
+    return (_by_groups if whole else _by_patches)(image, kernel_dot, rows)
 
 
 def _by_groups(image: Array, kernel: Array, rows: int) -> Array:

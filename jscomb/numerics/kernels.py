@@ -19,16 +19,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_image, weighted_ratio
-from jscomb.numerics.tiles import map_rows
+from jscomb.numerics.tiles import by_device, map_rows
 from jscomb.numerics.windows import check_window
 from jscomb.typing import Image, Mask
 
 __all__ = ["Kernels", "kernel_mean", "predicted_mean"]
 
-_ROWS, _WEIGHTS = (
-    16,
-    2**22,
-)  # of a strip: at least so many rows, or about so many weights
+_ROWS = 16  # of a strip, at least
 
 
 class Kernels(NamedTuple):
@@ -131,7 +128,8 @@ def predicted_mean(
             means.append(_mean(_weighted_sum(near[..., channels], kernel, window)))
         return jnp.concatenate(means, axis=-1)
 
-    rows = max(_ROWS, _WEIGHTS // (width * n * window**2))
+    weights = by_device(cpu=2**22, accelerator=2**26)  # of a strip, about
+    rows = max(_ROWS, weights // (width * n * window**2))
     mean = map_rows(strip, [(kernels.features, kernels.reach), (padded, r)], rows=rows)
     return jnp.stack(jnp.split(mean, n, axis=-1))
 

@@ -50,16 +50,21 @@ from jscomb.numerics.guards import (
     weighted_ratio,
     zero_invalid,
 )
-from jscomb.numerics.tiles import Grid, Planes, Region, flat, sum_over_tiles
+from jscomb.numerics.tiles import (
+    Grid,
+    Planes,
+    Region,
+    by_device,
+    flat,
+    sum_over_tiles,
+)
 from jscomb.numerics.weights import Weights, gaussian_weights, tile_weights
 from jscomb.numerics.windows import check_window, window_max, window_min
 from jscomb.typing import Image, Mask, Scalar
 
 __all__ = ["LocalFit", "joint_local_linear", "local_linear"]
 
-# Fastest on a CPU: a side of 16 centres or 32 pixels, and weights that just fit the
-# cache.
-_SIDE, _STEP, _CENTRES = 16, 32, 512
+_SIDE, _STEP = 16, 32  # of a tile, centres or pixels: fastest on a CPU
 
 
 class LocalFit(NamedTuple):
@@ -321,7 +326,9 @@ def _grid(window: int, stride: int) -> Grid:
             f"stride must be from 1 to {maximum} for {window=}, got {stride}"
         )
     side = max(1, min(_SIDE, _STEP // stride))
-    while (grid := Grid(side, stride, reach, max(1, _CENTRES // side**2))).side > 1:
+    # Those whose weights just fit the cache.
+    centres = by_device(cpu=512, accelerator=2**15)
+    while (grid := Grid(side, stride, reach, max(1, centres // side**2))).side > 1:
         if np.ptp(grid.places, axis=1).max() <= 1.5 * reach:
             break
         side -= 1

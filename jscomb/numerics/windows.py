@@ -214,12 +214,13 @@ def at_window_max(
         [[-3. -3. -2. -2.]]
     """
 
-    def pick(near: Image, far: Image) -> Image:
-        return jnp.where(near[..., :1] >= far[..., :1], near, far)
+    def pick(near: Array, far: Array) -> Array:
+        return jnp.where(near[:1] >= far[:1], near, far)
 
     both = jnp.concatenate([_only(by, mask, -np.inf), _only(image, mask, 0.0)], axis=-1)
-    best = _extremum(both, window, pick, -np.inf)
-    return jnp.where(best[..., :1] > -np.inf, best[..., 1:], 0.0)
+    # Planes, so that one comparison serves neighbours in memory.
+    best = _extremum(jnp.moveaxis(both, -1, 0), window, pick, -np.inf, axes=(2, 1))
+    return jnp.moveaxis(jnp.where(best[:1] > -np.inf, best[1:], 0.0), 0, -1)
 
 
 def separable_sum(
@@ -383,10 +384,16 @@ def _add_rows(image: Image, window: int) -> Image:
     return total + rows(image, rest, (r, r))[-height:] if rest else total
 
 
-def _extremum(image: Image, window: int, pick: Callable, neutral: float) -> Image:
+def _extremum(
+    image: Float[Array, "_ _ _"],
+    window: int,
+    pick: Callable,
+    neutral: float,
+    axes: tuple[int, int] = (1, 0),
+) -> Float[Array, "_ _ _"]:
     """Reduce by doubling; two runs may overlap, unlike those of a sum."""
     r = check_window(window) // 2
-    for axis in (1, 0):
+    for axis in axes:
         ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
         run, span = jnp.pad(image, ends, constant_values=neutral), 1
         while span < window:

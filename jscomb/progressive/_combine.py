@@ -14,6 +14,7 @@ from jscomb.numerics.guards import (
     safe_sqrt,
     zero_invalid,
 )
+from jscomb.numerics.tiles import in_one_pass
 from jscomb.numerics.windows import at_window_max, check_window, separable_sum
 from jscomb.progressive._estimate import mixing
 from jscomb.typing import Image, Scalar, Variance
@@ -144,10 +145,13 @@ def bound_mixing(
     )
     # Both are 0 at invalid pixels; masked again they would not be fused.
     kernel = _kernel(sigma, window)
-    mean = largest[..., :1] + separable_sum(moved, kernel)
-    error = largest[..., 1:] + separable_sum(noise, jnp.square(kernel))
-    t = _magnitude(mean, error)
-    return jnp.where(valid, alpha * ndtr(strength * (shift - t)), 0.0)
+    around = separable_sum(moved, kernel), separable_sum(noise, jnp.square(kernel))
+
+    def kept(largest: Array, mean: Noise, error: Noise) -> Noise:
+        t = _magnitude(largest[..., :1] + mean, largest[..., 1:] + error)
+        return ndtr(strength * (shift - t))
+
+    return jnp.where(valid, alpha * in_one_pass(kept, largest, *around), 0.0)
 
 
 def bound_sigma(

@@ -9,7 +9,14 @@ from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import safe_sqrt, weighted_ratio
 from jscomb.numerics.medians import median_of
-from jscomb.numerics.tiles import Grid, Planes, Region, fold_rows, sum_over_tiles
+from jscomb.numerics.tiles import (
+    Grid,
+    Planes,
+    Region,
+    by_device,
+    fold_rows,
+    sum_over_tiles,
+)
 from jscomb.numerics.windows import check_window, window_mean, window_sum
 from jscomb.typing import Image, Scalar
 from jscomb.uncorrelated._kernels import Kernel, variance_kernel
@@ -24,7 +31,7 @@ from jscomb.uncorrelated._pairs import (
     mean,
 )
 
-_TILE, _TILES = 64, 2
+_TILE = 64
 
 
 def combine(
@@ -348,5 +355,5 @@ def _pull(
     regions = [Region(planes, reach) for planes in (excess, valid, *each)]
     if scale is not None:
         regions.append(Region(jnp.moveaxis(scale, -1, 0), 0))
-    grid = Grid(tile, 1, reach, _TILES)
+    grid = Grid(tile, 1, reach, by_device(cpu=2, accelerator=64))
     return jnp.moveaxis(sum_over_tiles(pull, regions, grid, reach=0), 0, -1)

@@ -8,7 +8,14 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import weighted_ratio
-from jscomb.numerics.tiles import Grid, Planes, Region, fold_rows, sum_over_tiles
+from jscomb.numerics.tiles import (
+    Grid,
+    Planes,
+    Region,
+    by_device,
+    fold_rows,
+    sum_over_tiles,
+)
 from jscomb.numerics.windows import check_window, window_mean, window_sum
 from jscomb.typing import Scalar
 from jscomb.uncorrelated._kernels import rate_of
@@ -30,7 +37,7 @@ PAPER_MULTIPLES = 20, 50, 100, 200, 400, 1000, 2000, 3000, 4000, 5000
 MULTIPLES = 1, 2, 5, 10, *PAPER_MULTIPLES
 """Candidates of gamma, in units; those below 0.01 weigh almost equally."""
 
-_TILE, _TILES = 64, 1
+_TILE = 64
 
 
 def select_gamma(
@@ -352,7 +359,8 @@ def _squares(
         for images, around in ((near, reach), (here, 0))
         for image in images
     ]
-    return sum_over_tiles(squares, regions, Grid(tile, 1, reach, _TILES), reach=0)
+    grid = Grid(tile, 1, reach, by_device(cpu=1, accelerator=64))
+    return sum_over_tiles(squares, regions, grid, reach=0)
 
 
 def powers(base: Array, exponents: Sequence[int]) -> list[Array]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks import (
+    accelerators,
     files,
     large,
     performance,
@@ -100,6 +101,19 @@ def test_large_frames_of_any_size(glass_frame, tmp_path):
     assert grown.color.shape == (100, 100, 3)
     np.testing.assert_array_equal(grown.color[:64, :64], glass_frame.color)
     np.testing.assert_array_equal(grown.color[64:], grown.color[28:64][::-1])
+
+
+@pytest.mark.slow
+def test_programs_for_accelerators_are_counted():
+    programs = accelerators.run(accelerators.Config(quick=True))
+    assert set(programs) == set(performance.functions(quick=True))
+    assert all(each.callbacks == 0 < each.steps for each in programs.values())
+    in_loops = jax.make_jaxpr(
+        lambda x: jax.lax.fori_loop(0, 5, lambda _, y: jnp.sin(y) * 2, x)
+    )(1.0)
+    counted = sum(n for name, n in accelerators.primitives(in_loops.jaxpr)
+                  if name in ("sin", "mul"))  # fmt: skip
+    assert counted == 10
 
 
 def test_robustness_counts_what_is_bad():

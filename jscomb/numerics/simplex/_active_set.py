@@ -16,12 +16,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jscomb.numerics.guards import divide
+from jscomb.numerics.tiles import by_device
 
 Flat = Float[Array, "n m"]  # weights of M problems
 Free = Bool[Array, "n m"]
 
 _STEPS = 16  # for each base; needed only where rounding decides
-_CHUNK = 4096
+
+
+def _at_once() -> int:
+    """Problems at a time: those that fit into a cache."""
+    return by_device(cpu=4096, accelerator=2**20)
 
 
 def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
@@ -29,15 +34,15 @@ def in_chunks(function: Callable[..., Flat], *arrays: Array) -> Flat:
 
     They fit into the cache, and only they wait for the slowest among them.
     """
-    count = arrays[0].shape[-1]
-    pieces = -(-count // _CHUNK)
+    count, size = arrays[0].shape[-1], _at_once()
+    pieces = -(-count // size)
     if pieces <= 1:
         return function(*arrays)
 
     def pieces_of(array: Array) -> Array:
-        ends = [(0, 0)] * (array.ndim - 1) + [(0, pieces * _CHUNK - count)]
+        ends = [(0, 0)] * (array.ndim - 1) + [(0, pieces * size - count)]
         padded = jnp.pad(array, ends)
-        return jnp.moveaxis(padded.reshape(*array.shape[:-1], pieces, _CHUNK), -2, 0)
+        return jnp.moveaxis(padded.reshape(*array.shape[:-1], pieces, size), -2, 0)
 
     each = lax.map(lambda piece: function(*piece), tuple(map(pieces_of, arrays)))
     return jnp.moveaxis(each, 0, 1).reshape(each.shape[1], -1)[:, :count]
@@ -60,7 +65,7 @@ def solve_where(
     count = len(needed)
     place = jnp.cumsum(needed, dtype=jnp.int32)  # of the needed ones, from 1
     needs = place[-1]
-    block = min(_CHUNK, count)
+    block = min(_at_once(), count)
 
     def with_room_for(most: int) -> Callable[..., Flat]:
         room = -(-most // block) * block

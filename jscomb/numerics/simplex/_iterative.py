@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.simplex._active_set import Flat
-from jscomb.numerics.simplex._plane import Points, Targets, Weights, plane, share_of
+from jscomb.numerics.simplex._plane import Points, Targets, Weights, plane, share_within
 from jscomb.numerics.simplex._quadratic import Matrix, objective_of, share_along
 from jscomb.typing import Key
 
@@ -58,7 +58,9 @@ def iterative(
 
     def share(w: Flat, base: Array) -> Float[Array, " m"]:
         now = jnp.sum(w[:, None] * u, axis=0)
-        return share_of(now, u[base], c)
+        d = u[base] - now
+        along = -jnp.sum((now + c) * d, axis=0)
+        return share_within(along, jnp.sum(d * d, axis=0), 0.5)
 
     w = _cycles(key, share, (len(u), u.shape[2]), u.dtype, steps, tolerance, patience)
     return w.reshape(points_a.shape)

@@ -20,7 +20,7 @@ from jscomb.numerics.tiles._neighbourhoods import (
     sum_over_tiles,
 )
 from jscomb.numerics.tiles._plans import network_plan
-from jscomb.numerics.tiles._programs import compiled, in_one_pass
+from jscomb.numerics.tiles._programs import by_device, compiled, in_one_pass
 
 __all__ = [
     "Crop",
@@ -29,6 +29,7 @@ __all__ = [
     "Planes",
     "Region",
     "Span",
+    "by_device",
     "compiled",
     "crops",
     "flat",

@@ -38,6 +38,26 @@ def _compiled(function: Callable[..., Any], *static: tuple[str, Hashable]) -> Ca
     return jax.jit(functools.partial(function, **dict(static)))
 
 
+def by_device(*, cpu: int, accelerator: int) -> int:
+    """Return how much to compute at a time, on the device that programs run on.
+
+    What fits into a processor's cache leaves most cores of an accelerator idle, and
+    each piece costs it a launch of every loop.
+
+    Args:
+        cpu: on processors.
+        accelerator: on all other devices.
+
+    Returns:
+        one of both.
+
+    Example:
+        >>> by_device(cpu=1, accelerator=2)
+        1
+    """
+    return cpu if jax.default_backend() == "cpu" else accelerator
+
+
 def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return function(*arguments), computed from arrays in memory, in loops of its own.
 
@@ -46,7 +66,7 @@ def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
 
     Args:
         function: of the arguments; elementwise, or there is nothing to gain.
-        arguments: trees of arrays; the first element of the first one is finite.
+        arguments: trees of arrays.
 
     Returns:
         what the function returns.
@@ -60,5 +80,5 @@ def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
     first = jax.tree.leaves(arguments)[0].ravel()
     # A branch that is always taken, which the compiler cannot know: nothing is fused
     # across it. It removes `lax.optimization_barrier` on CPUs.
-    taken = jnp.all(jnp.isfinite(first[:1]))
-    return lax.cond(taken, function, never, *arguments)
+    at_most_one = jnp.sum(first[:1] == 0)
+    return lax.cond(at_most_one < 2, function, never, *arguments)

@@ -16,13 +16,14 @@ from jscomb.numerics.tiles import (
     Grid,
     Planes,
     Region,
+    by_device,
     flat,
     fold_rows,
     sum_over_tiles,
 )
 from jscomb.numerics.windows import check_window
 
-_TILE, _TILES = 64, 2  # pixels a side, and at once
+_TILE = 64  # pixels a side
 
 Pairs = Float[Array, "_ _ _ ..."]  # planes of one pixel of each pair
 
@@ -71,7 +72,7 @@ def weighted_mean(
     valid, clean, guide = zero_invalid(image, weights.image)
     reach, halo = check_window(window) // 2, weights.halo
     tile = min(_TILE, max(image.shape[:2]))
-    grid = Grid(tile, 1, reach, _TILES)
+    grid = Grid(tile, 1, reach, by_device(cpu=2, accelerator=64))
     wide = tile + 2 * halo
 
     def region(planes: Float[Array, "h w _"], reach: int) -> Region:
