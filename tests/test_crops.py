@@ -1,5 +1,6 @@
 """Large images by crops and on several devices: equal to the whole, to rounding."""
 
+import functools
 import os
 import socket
 import subprocess
@@ -163,3 +164,24 @@ def test_too_many_devices_are_named():
     devices = jax.devices() * 3  # as if there were three
     with pytest.raises(ValueError, match="4 rows on 3 devices are 2 each, and 4"):
         tiles.map_shards(lambda i: i, image, halo=2, devices=devices)
+
+
+@pytest.mark.parametrize("first", [0.0, 1e-8, np.inf, np.nan])
+def test_one_pass_is_the_function(first):
+    def both(x, y):
+        return x * y, {"sum": x + y}
+
+    x, y = jnp.array([first, 2.0, 3.0]), jnp.array([4.0, 5.0, 6.0])
+    apart = functools.partial(tiles.in_one_pass, both)
+    np.testing.assert_array_equal(jax.jit(apart)(x, y)[0], x * y)
+    np.testing.assert_array_equal(jax.vmap(apart)(x, y)[1]["sum"], x + y)
+    gradient = jax.grad(lambda x: jnp.sum(apart(x, y)[0]))(x)
+    np.testing.assert_array_equal(gradient, y)
+    _, tangent = jax.jvp(lambda x: apart(x, y)[0], (x,), (jnp.ones(3),))
+    np.testing.assert_array_equal(tangent, y)
+    # The compiler must not see that the branch is always taken.
+    assert "conditional(" in jax.jit(apart).lower(x, y).compile().as_text()
+
+
+def test_nothing_is_in_one_pass():
+    assert tiles.in_one_pass(jnp.sin, jnp.zeros((0, 2))).shape == (0, 2)
