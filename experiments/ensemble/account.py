@@ -172,9 +172,9 @@ FIGURES = (
         "about one second for the solver, tens of milliseconds for the filter on a GPU",
         where=(_SOLVERS,),
         measured=(_SOLVERS,),
-        note="On two CPU cores, a megapixel of four bases: the exact solver 0.89 s, "
-        "the paper's in JAX 6.2 s (1024 steps), multi-scale weights 0.09 s, the filter "
-        "0.52 s, 13 times its exponentials. Not measured on a GPU.",
+        note="On two CPU cores, a megapixel of four bases: the exact solver 0.15 s, "
+        "the paper's in JAX 5.1 s (1024 steps), multi-scale weights 0.10 s, the filter "
+        "0.45 s, 11 times its exponentials. Not measured on a GPU.",
     ),
     Claim(
         "fig. 4",
@@ -193,8 +193,8 @@ FIGURES = (
         where=(_SOLVERS, "numerics.simplex.reference"),
         measured=(_SOLVERS, _WEIGHTS),
         note="With jaxopt's OSQP in place of FBstab. Above the least objective, over "
-        "the worst base's, four bases: the paper's solver 2e-3 at most, 3e-5 in "
-        "the mean, OSQP 6e-10. Images by both have equal errors: 1.00 of "
+        "the worst base's, four bases: the paper's solver 2e-3 at most, 2e-5 in "
+        "the mean, OSQP 5e-10. Images by both have equal errors: 1.00 of "
         "relative L2 and DSSIM over the exact solver's, 29 frames.",
     ),
     Claim(
@@ -202,10 +202,10 @@ FIGURES = (
         "the iterative solver is about ten times as fast as the general one",
         where=(_SOLVERS,),
         measured=(_SOLVERS,),
-        note="38 to 600 times as fast as OSQP with two to eight bases (3.5 to 13 s and "
-        "135 to 7800 s a megapixel): OSQP in float64, to a tight tolerance, is no fast "
-        "general solver. The exact solver takes 0.04 to 5.5 s: with four bases a "
-        "seventh of the paper's.",
+        note="41 to 111 times as fast as OSQP with two to eight bases (3.2 to 18 s and "
+        "131 to 1560 s a megapixel): OSQP in float64, to a tight tolerance, is no fast "
+        "general solver. The exact solver takes 0.01 to 0.64 s: with four bases a "
+        "35th of the paper's.",
     ),
     Claim(
         "fig. 7",

@@ -81,7 +81,8 @@ def solve_where(
         @jax.checkpoint  # or what a derivative needs were kept of both sizes
         def solve_all(w: Flat, *arrays: Array) -> Flat:
             nth = jnp.arange(room, dtype=jnp.int32)
-            index = jnp.searchsorted(place, nth + 1)  # beyond the last problem: dropped
+            index = jnp.searchsorted(place, nth + 1)
+            index = jnp.where(nth < needs, index, count + nth)  # unique; dropped
             pieces = [packed(array, index) for array in (*arrays, w)]
             each = lax.map(solved, (nth[::block], *pieces))
             flat = jnp.moveaxis(each, 0, 1).reshape(len(w), -1)
