@@ -109,12 +109,13 @@ def hull(
 def _nearest(u: Sequence[Point], c: Point) -> tuple[Pairs, Bool[Array, " m"]]:
     """The pair whose segment comes nearest; whether the hull may surround the target.
 
-    It does not surround a target from which all other points are to the left of one.
+    It does not surround a target from which all other points are to the left of one, or
+    at the same place.
     """
     n, (u, c) = len(u), lax.stop_gradient((u, c))
     distance = _distance_to(c)
     least, pair = jnp.full_like(c[0], jnp.inf), jnp.zeros(c[0].shape, jnp.uint32)
-    differ, rightmost = jnp.zeros(pair.shape, bool), [jnp.ones(pair.shape, bool)] * n
+    rightmost = [jnp.ones(pair.shape, bool)] * n
     for i, j in itertools.combinations(range(n), 2):
         along, square = segment(u[i], u[j], c)
         share = jnp.clip(along / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
@@ -125,11 +126,10 @@ def _nearest(u: Sequence[Point], c: Point) -> tuple[Pairs, Bool[Array, " m"]]:
         nearer = of_pair < least
         least = jnp.where(nearer, of_pair, least)
         pair = jnp.where(nearer, jnp.uint32(i * n + j), pair)
-        turn = cross(u[i], u[j], c)
-        rightmost[i] &= turn > 0
-        rightmost[j] &= turn < 0
-        differ |= square > 0
-    return pair, differ & ~functools.reduce(operator.or_, rightmost)
+        turn, same = cross(u[i], u[j], c), square == 0
+        rightmost[i] &= same | (turn > 0)
+        rightmost[j] &= same | (turn < 0)
+    return pair, ~functools.reduce(operator.or_, rightmost)
 
 
 def _distance_to(c: Point) -> Callable[[Array, Array], Float[Array, " m"]]:

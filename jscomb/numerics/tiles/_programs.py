@@ -61,8 +61,8 @@ def by_device(*, cpu: int, accelerator: int) -> int:
 def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return function(*arguments), computed from arrays in memory, in loops of its own.
 
-    XLA fuses what makes an array into every loop that reads it, so that it is computed
-    anew for each of N results.
+    For CPUs, XLA fuses what makes an array into every loop that reads it, so that it is
+    computed anew for each of N results. Elsewhere its own choice stands.
 
     Args:
         function: of the arguments; elementwise, or there is nothing to gain.
@@ -75,6 +75,8 @@ def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
         >>> print(in_one_pass(lambda x: (x, 2 * x), jnp.ones(1))[1])
         [2.]
     """
+    if jax.default_backend() != "cpu":
+        return function(*arguments)
     like = jax.eval_shape(function, *arguments)
     never = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     first = jax.tree.leaves(arguments)[0].ravel()
