@@ -128,7 +128,7 @@ def predicted_mean(
             means.append(_mean(_weighted_sum(near[..., channels], kernel, window)))
         return jnp.concatenate(means, axis=-1)
 
-    weights = by_device(cpu=2**22, accelerator=2**26)  # of a strip, about
+    weights = by_device(cpu=2**22, accelerator=2**28)  # of a strip, about
     rows = max(_ROWS, weights // (width * n * window**2))
     mean = map_rows(strip, [(kernels.features, kernels.reach), (padded, r)], rows=rows)
     return jnp.stack(jnp.split(mean, n, axis=-1))

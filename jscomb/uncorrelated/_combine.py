@@ -13,9 +13,9 @@ from jscomb.numerics.tiles import (
     Grid,
     Planes,
     Region,
-    by_device,
     fold_rows,
     sum_over_tiles,
+    tile_side,
 )
 from jscomb.numerics.windows import check_window, window_mean, window_sum
 from jscomb.typing import Image, Scalar
@@ -30,8 +30,6 @@ from jscomb.uncorrelated._pairs import (
     make_pairs,
     mean,
 )
-
-_TILE = 64
 
 
 def combine(
@@ -333,7 +331,7 @@ def _pull(
     excess = jnp.moveaxis(pairs.excess, -1, 0)
     valid = jnp.moveaxis(pairs.valid, -1, 0).astype(excess.dtype)
     each = jnp.moveaxis(guides, -1, 1)
-    tile = min(_TILE, max(excess.shape[1:]))
+    tile = tile_side(*excess.shape[1:])
     centre = slice(reach, reach + tile)
 
     def pull(*planes: Planes) -> Planes:
@@ -355,5 +353,5 @@ def _pull(
     regions = [Region(planes, reach) for planes in (excess, valid, *each)]
     if scale is not None:
         regions.append(Region(jnp.moveaxis(scale, -1, 0), 0))
-    grid = Grid(tile, 1, reach, by_device(cpu=2, accelerator=64))
+    grid = Grid(tile, 1, reach, 2)
     return jnp.moveaxis(sum_over_tiles(pull, regions, grid, reach=0), 0, -1)

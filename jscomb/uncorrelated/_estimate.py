@@ -12,9 +12,9 @@ from jscomb.numerics.tiles import (
     Grid,
     Planes,
     Region,
-    by_device,
     fold_rows,
     sum_over_tiles,
+    tile_side,
 )
 from jscomb.numerics.windows import check_window, window_mean, window_sum
 from jscomb.typing import Scalar
@@ -36,8 +36,6 @@ PAPER_MULTIPLES = 20, 50, 100, 200, 400, 1000, 2000, 3000, 4000, 5000
 
 MULTIPLES = 1, 2, 5, 10, *PAPER_MULTIPLES
 """Candidates of gamma, in units; those below 0.01 weigh almost equally."""
-
-_TILE = 64
 
 
 def select_gamma(
@@ -308,8 +306,7 @@ def _squares(
     that are read at their centres.
     """
     reach = check_window(window) // 2
-    size = max(here[0].shape[:2])
-    tile = stride * -(-min(_TILE, size) // stride)
+    tile = stride * -(-tile_side(*here[0].shape[:2]) // stride)
     rows, columns = slice(reach, reach + tile, stride), slice(reach, reach + tile)
 
     def squares(excess: Planes, *planes: Planes) -> Planes:
@@ -359,8 +356,7 @@ def _squares(
         for images, around in ((near, reach), (here, 0))
         for image in images
     ]
-    grid = Grid(tile, 1, reach, by_device(cpu=1, accelerator=64))
-    return sum_over_tiles(squares, regions, grid, reach=0)
+    return sum_over_tiles(squares, regions, Grid(tile, 1, reach, 1), reach=0)
 
 
 def powers(base: Array, exponents: Sequence[int]) -> list[Array]:

@@ -18,6 +18,7 @@ from jscomb.numerics.tiles._neighbourhoods import (
     fold_rows,
     map_rows,
     sum_over_tiles,
+    tile_side,
 )
 from jscomb.numerics.tiles._plans import network_plan
 from jscomb.numerics.tiles._programs import by_device, compiled, in_one_pass
@@ -41,5 +42,6 @@ __all__ = [
     "network_plan",
     "stream_crops",
     "sum_over_tiles",
+    "tile_side",
     "tile_within",
 ]

@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jscomb.numerics.tiles._programs import by_device
+
 Planes = Float[Array, "_ _ _"]  # [K,H,W], or a part of it
 Carry = TypeVar("Carry")
 
@@ -91,6 +93,23 @@ class Region(NamedTuple):
 
     planes: Planes
     reach: int
+
+
+def tile_side(height: int, width: int) -> int:
+    """Return the side of tiles in pixels for functions of every pixel's window.
+
+    Args:
+        height: of the image.
+        width: of the image.
+
+    Returns:
+        the side that suits the device, at most that of the image.
+
+    Example:
+        >>> tile_side(1080, 1920), tile_side(3, 5)
+        (64, 5)
+    """
+    return min(by_device(cpu=64, accelerator=512), max(height, width))
 
 
 def sum_over_tiles(

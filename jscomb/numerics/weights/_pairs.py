@@ -16,14 +16,12 @@ from jscomb.numerics.tiles import (
     Grid,
     Planes,
     Region,
-    by_device,
     flat,
     fold_rows,
     sum_over_tiles,
+    tile_side,
 )
 from jscomb.numerics.windows import check_window
-
-_TILE = 64  # pixels a side
 
 Pairs = Float[Array, "_ _ _ ..."]  # planes of one pixel of each pair
 
@@ -71,8 +69,8 @@ def weighted_mean(
     check_image(image=image, guide=weights.image)
     valid, clean, guide = zero_invalid(image, weights.image)
     reach, halo = check_window(window) // 2, weights.halo
-    tile = min(_TILE, max(image.shape[:2]))
-    grid = Grid(tile, 1, reach, by_device(cpu=2, accelerator=64))
+    tile = tile_side(*image.shape[:2])
+    grid = Grid(tile, 1, reach, 2)
     wide = tile + 2 * halo
 
     def region(planes: Float[Array, "h w _"], reach: int) -> Region:
