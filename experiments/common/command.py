@@ -49,14 +49,18 @@ def main(
     options, found = _called(config, name, doc, lambda options: report(run(options)))
     print(f"{found.answer}\n\n{found.body}")
     if options.report is not None:
-        command = shlex.join(["python", "-m", name, *_without_folders(sys.argv[1:])])
+        command = shlex.join(["python", "-m", name, *without_folders(sys.argv[1:])])
         write(options.report, name, doc, command, found)
 
 
-def _without_folders(words: list[str]) -> list[str]:
-    """Absolute paths by their names, or whose folder it was would be told.
+def without_folders(words: list[str]) -> list[str]:
+    """Shorten absolute paths to their names, or whose folder it was would be told.
 
-    The folder's name stays where two paths have one name.
+    Args:
+        words: of a command.
+
+    Returns:
+        the words, with the last folder too of paths that share a name.
     """
     names = [pathlib.Path(word).name for word in words]
 

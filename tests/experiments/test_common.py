@@ -107,6 +107,13 @@ def test_a_report_replaces_the_one_before(folder, monkeypatch, capsys, tmp_path)
         command.main(error.Config, error.run, error.report)
 
 
+def test_a_reported_command_tells_no_folders():
+    """But as much of a path as tells two files of one name apart."""
+    words = ["/of/alice/x.npz", "/a/b/scene.xml", "/a/c/scene.xml", "--size", "3"]
+    told = ["x.npz", "b/scene.xml", "c/scene.xml", "--size", "3"]
+    assert command.without_folders(words) == told
+
+
 def test_the_index_is_of_the_results():
     assert index.README.read_text() == index.indexed(index.README.read_text())
     assert len(index.README.read_text().splitlines()) < 100
