@@ -4,6 +4,11 @@ from experiments.common.claims import Claim
 from experiments.common.claims import account as report
 from experiments.common.command import Options, main
 
+_FORMS = "experiments.comparison.forms"
+_LEARNED = "experiments.training.learned"
+_CONVERGENCE = "experiments.comparison.convergence"
+_EQUAL_TIME = "experiments.comparison.equal_time"
+
 CLAIMS = (
     Claim(
         "eq. 1",
@@ -42,7 +47,7 @@ CLAIMS = (
         "eq. 6",
         "variance of a window: mean of sample variances with predicted weights",
         where=("james_stein.smooth_variance", "learning.networks.JamesSteinNetwork"),
-        measured=("experiments.training.learned",),
+        measured=(_LEARNED,),
         note="The network adds 1e-4 to its weights. The one that ships is trained for "
         "the whitened 7x7 rule, whose variance is the greater of a pixel's own and "
         "this mean.",
@@ -93,14 +98,14 @@ CLAIMS = (
         "eq. 12",
         "y* = alpha y^_a + (1-alpha) y^_b, alpha predicted",
         where=("james_stein.neural_combine", "james_stein.regress"),
-        measured=("experiments.training.learned",),
+        measured=(_LEARNED,),
         note="Without a network alpha is 1/2.",
     ),
     Claim(
         "eq. 13",
         "final estimate: eq. 7 with the positive part, towards y*",
         where=("james_stein.combine", "james_stein.neural_combine_frame"),
-        measured=("experiments.training.learned",),
+        measured=(_LEARNED,),
         note="On frames y* stands for y only where the halves show that it helps "
         "(james_stein.worth_regressing, ours).",
     ),
@@ -132,7 +137,7 @@ CLAIMS = (
         where=("james_stein.combine",),
         measured=(
             "experiments.james_stein.error",
-            "experiments.training.learned",
+            _LEARNED,
             "experiments.double_shrinkage.photons",
         ),
         note="Tests hold it under Gaussian noise and a y apart from x. Below path "
@@ -155,7 +160,7 @@ CLAIMS = (
         "not surely below y, but the lower y's error the lower the result's, and in "
         "practice below y too",
         where=("james_stein.risk_bound",),
-        measured=("experiments.james_stein.error", "experiments.training.learned"),
+        measured=("experiments.james_stein.error", _LEARNED),
         note="Below OIDN: james-stein in 10 of 20 frames, whitened in 15 (worst "
         "1.00), the trained njs in 23 of 35.",
     ),
@@ -173,7 +178,7 @@ CLAIMS = (
         "section 4.4",
         "U-Net of x, its variance, y^_a, y^_b; 226 outputs; 0.54 million parameters",
         where=("learning.networks.JamesSteinNetwork", "learning.unet.UNet"),
-        measured=("experiments.training.learned",),
+        measured=(_LEARNED,),
         note="Size full has the paper's width, light half of it; light is what ships. "
         "Radiance enters as a signed logarithm. Over the better input 0.967 trained, "
         "0.956 untrained, 0.958 without a network: on these frames, with OIDN, "
@@ -183,7 +188,7 @@ CLAIMS = (
         "section 5, training",
         "1284 image sets, 50 epochs, batch 4 of 128x128, Adam 1e-4, eight hours",
         where=("learning.training.Schedule", "experiments.training.train"),
-        measured=("experiments.training.learned",),
+        measured=(_LEARNED,),
         note="Ours: 263 frames, 1500 steps of 8 crops of 64x64, one-cycle Adam to "
         "5e-4, by the network's card; far less. Validation chose the step, as there.",
     ),
@@ -215,7 +220,7 @@ CLAIMS = (
         "fig. 1",
         "KPCN and AFGSA with and without, 16 to 2K samples: denoisers fall behind "
         "path tracing, combined they do not",
-        where=("experiments.comparison.convergence",),
+        where=(_CONVERGENCE,),
         measured=("experiments.james_stein.weak_denoisers",),
         note="KPCN and AFGSA are not here. With OIDN njs has 1.04, 0.934, 0.953, "
         "0.659, 0.797, 0.752 of the denoiser at 4 to 4096 samples; path tracing has "
@@ -226,7 +231,7 @@ CLAIMS = (
         "MSE-based mixing (PD) against ours: KPCN 0.0021 becomes 0.0036 and 0.0013, "
         "AFGSA 0.0088 becomes 0.0103 and 0.0054",
         where=("progressive.combine_frame", "james_stein.combine_frame"),
-        measured=("experiments.training.learned",),
+        measured=(_LEARNED,),
         note="With OIDN the trained pd has 0.910 of the better input (worst 2.25), "
         "njs 0.967 (1.41): PD gains more in the mean and harms more at worst.",
     ),
@@ -250,10 +255,7 @@ CLAIMS = (
         "y of a 15x15 box: 0.0062 and 0.0739 become 0.0026, 0.0142 and 0.974 become "
         "0.0065",
         where=("denoisers.smoothing.box", "james_stein.combine"),
-        measured=(
-            "experiments.comparison.stability",
-            "experiments.comparison.forms",
-        ),
+        measured=("experiments.comparison.stability", _FORMS),
         note="A box for y, 5.7 times the error of path tracing, 29 test frames: "
         "james-stein is below it in 29 (0.34 of it), whitened 27, njs 29 (0.16). Not "
         "surely: around one caustic james-stein had 1.3 times its error.",
@@ -261,8 +263,8 @@ CLAIMS = (
     Claim(
         "fig. 6",
         "the same from 16 to 2K samples: below path tracing throughout",
-        where=("experiments.comparison.convergence",),
-        measured=("experiments.comparison.forms",),
+        where=(_CONVERGENCE,),
+        measured=(_FORMS,),
         note="With a box james-stein is below path tracing in all of 29 test frames, "
         "4 to 4096 samples: 13.3 to 2.01 of the better of OIDN and path tracing, "
         "which has 87.4 to 3.47; njs 5.48 to 1.38.",
@@ -281,7 +283,7 @@ CLAIMS = (
         "fig. 8",
         "combined error with y and with y*, by sample count",
         where=("experiments.comparison.combiners",),
-        measured=("experiments.comparison.forms",),
+        measured=(_FORMS,),
         note="The contrary with OIDN: njs has 1.57 of the better input towards y*, "
         "0.961 towards y, 0.981 by the choice of the halves (29 test frames). OIDN "
         "sees the features already; the paper has KPCN and AFGSA.",
@@ -296,21 +298,17 @@ CLAIMS = (
         "fig. 10",
         "equal time, five scenes: 0.35 to 0.51 of KPCN's error, 0.28 to 0.68 of "
         "AFGSA's; deep combiner and PD sometimes harm",
-        where=("experiments.comparison.equal_time",),
-        measured=("experiments.comparison.equal_time",),
-        note="Three scenes, OIDN: for njs' error at the median of its times, denoised "
-        "path tracing takes 1.0 (staircase2), 1.2 (living-room) and over 3.7 times as "
-        "long (veach-bidir), for pd's 0.9, 1.8 and over 3.9 times, for the tier "
-        "`balanced`'s 1.2, 2.9 and over 3.6 times. The deep combiner is not here.",
+        where=(_EQUAL_TIME,),
+        measured=(_EQUAL_TIME,),
+        note="Over the time of njs, denoised path tracing takes 1.0 (staircase2), 1.2 "
+        "(living-room) and over 3.7 (veach-bidir) for its error; of pd 0.9, 1.8, over "
+        "3.9; of `balanced` 1.2, 2.9, over 3.6. The deep combiner is not here.",
     ),
     Claim(
         "fig. 11",
         "convergence beside PD and the deep combiner, KPCN and AFGSA",
-        where=("experiments.comparison.convergence",),
-        measured=(
-            "experiments.comparison.convergence",
-            "experiments.training.learned",
-        ),
+        where=(_CONVERGENCE,),
+        measured=(_CONVERGENCE, _LEARNED),
         note="At equal samples, OIDN, 4 to 4096: njs 1.10, 0.950, 0.980, 0.978, "
         "0.891, 0.910 of the better input, pd 1.14, 0.887, 0.963, 0.842, 0.871, "
         "0.827. The paper has PD harm up to 2K samples; ours has other training.",
@@ -319,7 +317,7 @@ CLAIMS = (
         "fig. 12",
         "equal time beside ensemble denoising: Veach-Ajar 0.0064, with path tracing "
         "as a base 0.291, with NFOR 0.0326",
-        measured=("experiments.comparison.forms",),
+        measured=(_FORMS,),
         note="At equal samples, of OIDN with and without features: ensemble 0.908 of "
         "the better input, with path tracing 0.900 (worst 1.03), whitened James-Stein "
         "after it 0.877. Path tracing as a base harms in the paper; our weights are "
@@ -328,7 +326,7 @@ CLAIMS = (
     Claim(
         "fig. 13",
         "convergence of the same",
-        measured=("experiments.comparison.forms",),
+        measured=(_FORMS,),
         note="At 4 to 4096 samples, of the better input: ensemble 0.968 to 0.826, "
         "with path tracing 0.983 to 0.769, njs after the first 1.06 to 0.778.",
     ),
@@ -336,7 +334,7 @@ CLAIMS = (
         "fig. 14",
         "an ensemble's image as y: lower than the ensemble and than path tracing",
         where=("ensemble.combine_frame", "james_stein.combine_frame"),
-        measured=("experiments.comparison.forms",),
+        measured=(_FORMS,),
         note="njs towards the ensemble of two denoisers has 0.983 of its error (29 "
         "test frames): above it at 4 samples (1.06, 0.968), below it from 64 on; "
         "below path tracing in all.",
@@ -395,10 +393,7 @@ CLAIMS = (
         "full pair or crossed halves: Curly-hair 0.0041 and 0.0043 at 128 samples, "
         "Glass-of-water 0.00275 both at 2K",
         where=("james_stein.combine_dual", "james_stein.neural_combine_dual"),
-        measured=(
-            "experiments.james_stein.error",
-            "experiments.comparison.forms",
-        ),
+        measured=("experiments.james_stein.error", _FORMS),
         note="Without networks, development frames: full 0.949, dual 2.56 of the "
         "better input; in the paper at most 21 % worse. 29 test frames: whitened "
         "0.950, dual 0.990; with the network 0.981 and 0.989, worse at 16 samples "
