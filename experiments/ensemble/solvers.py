@@ -67,7 +67,9 @@ def gradient(*halves):
 
     def total(*halves):
         w = simplex.hull(*halves)
-        return jnp.sum(jnp.moveaxis(w, 0, -1) * jnp.arange(1.0, 1.0 + len(w)))
+        return jnp.sum(
+            jnp.moveaxis(w, 0, -1) * jnp.arange(1, 1 + len(w), dtype=w.dtype)
+        )
 
     return jax.grad(total, argnums=(0, 1, 2, 3))(*halves)
 
