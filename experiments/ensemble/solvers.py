@@ -67,9 +67,7 @@ def gradient(*halves):
 
     def total(*halves):
         w = simplex.hull(*halves)
-        return jnp.sum(
-            jnp.moveaxis(w, 0, -1) * jnp.arange(1, 1 + len(w), dtype=w.dtype)
-        )
+        return sum((i + 1) * jnp.sum(of_base) for i, of_base in enumerate(w))
 
     return jax.grad(total, argnums=(0, 1, 2, 3))(*halves)
 
