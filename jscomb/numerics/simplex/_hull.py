@@ -95,7 +95,7 @@ def hull(
 
     Source: ours, for the objective of ED eq. 14.
     """
-    u, c = coordinates(points_a, points_b, target_a, target_b)
+    u, c = in_one_pass(coordinates, points_a, points_b, target_a, target_b)
     if len(u) == 1:
         return jnp.ones_like(points_a)
     pair, surrounded = in_one_pass(_nearest, u, c)
