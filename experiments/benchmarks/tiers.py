@@ -38,12 +38,10 @@ class Config(Options):
     Attributes:
         frame: EXR file.
         sizes: widths and heights in pixels.
-        large: more sizes, for all tiers but the last, whose memory they exceed.
     """
 
     frame: tyro.conf.Positional[pathlib.Path]
     sizes: tuple[int, ...] = (512, 1024)
-    large: tuple[int, ...] = (2048,)
 
 
 class Cost(NamedTuple):
@@ -130,13 +128,13 @@ def run(config: Config) -> tuple[dict[tuple[int, str], Cost], dict[int, dict]]:
     Returns:
         costs by size and tier; seconds of the parts of the last tier by size.
     """
-    sizes, large, tiers = config.sizes, config.large, [*TIERS]
+    sizes, tiers = config.sizes, [*TIERS]
     if config.quick:
-        sizes, large, tiers = (96,), (), tiers[:1]
-    cases = [(size, tier) for size in sizes for tier in tiers]
-    cases += [(size, tier) for size in large for tier in tiers[:-1]]
+        sizes, tiers = (96,), tiers[:1]
     found = {
-        case: apart(cost, config.frame, *case) for case in tqdm(cases, unit="case")
+        (size, tier): apart(cost, config.frame, size, tier)
+        for size in tqdm(sizes, unit="size")
+        for tier in tiers
     }
     return found, {s: apart(parts, config.frame, s, tiers[-1]) for s in sizes}
 
@@ -155,7 +153,7 @@ def report(result: tuple[dict[tuple[int, str], Cost], dict[int, dict]]) -> Repor
         [size, tier, c.second / c.denoising, c.second, c.first, c.denoising, c.memory]
         for (size, tier), c in found.items()
     ]
-    largest = max(shares)
+    largest = max(size for size, _ in found)
     said = [
         f"{tier} {c.second / c.denoising:.3g}"
         for (size, tier), c in found.items()

@@ -53,8 +53,8 @@ def solve_where(
 ) -> Flat:
     """Return the weights w, solved anew where it is needed.
 
-    The needed problems are packed into blocks, so that the others do not wait for them.
-    Few take an eighth of the memory of many.
+    The needed problems are packed into blocks, so that the others do not wait for them;
+    where at most an eighth is needed, there is room for no more.
 
     Args:
         needed: problems to solve, shape [M].
