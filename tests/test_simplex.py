@@ -9,6 +9,8 @@ import pytest
 from jax.test_util import check_grads
 
 from jscomb.numerics import simplex
+from jscomb.numerics.simplex import _quadratic
+from jscomb.numerics.simplex._pivots import free_by_pivots
 
 hull = jax.jit(simplex.hull)
 quadratic = jax.jit(simplex.quadratic)
@@ -193,6 +195,24 @@ def test_quadratic_is_optimal(n, rank, rng):
     np.testing.assert_allclose(value(w), value(general), atol=1e-7)
     single = quadratic(jnp.asarray(matrix, jnp.float32))
     assert abs(value(np.asarray(single, np.float64)) - value(w)).max() < 1e-4
+
+
+def test_pivots_tell_which_bases_are_in_use(rng):
+    matrix = random_matrix(rng, 8, 9, 2000)
+    errors = jnp.asarray(np.einsum("iim->im", matrix))
+    best = jnp.arange(8)[:, None] == jnp.argmin(errors, axis=0)[None]
+    k, linear, _, tolerance = _quadratic.objective_of(jnp.asarray(matrix))
+    free = free_by_pivots(k, linear, tolerance, best)
+    np.testing.assert_array_equal(free, quadratic(matrix) > 0)
+
+
+def test_the_search_finds_what_pivots_do_not(rng, monkeypatch):
+    matrix = random_matrix(rng, 6, 7)
+    w = quadratic(matrix)
+    none = lambda matrix, linear, tolerance, best: best
+    monkeypatch.setattr(_quadratic, "free_by_pivots", none)
+    searched = jax.jit(lambda m: simplex.quadratic(m))(matrix)
+    np.testing.assert_allclose(searched, w, atol=1e-9)
 
 
 def test_a_matrix_that_is_not_semidefinite(rng):

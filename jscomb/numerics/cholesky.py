@@ -1,5 +1,7 @@
 """Many small symmetric systems at once, the batch last: loops run over the unknowns."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -13,6 +15,8 @@ def solve(
     minimum: Float[Array, "f _"],
 ) -> Float[Array, "f c m"]:
     """Solve M systems of F unknowns, each with C right sides.
+
+    Derivatives are solutions of the same systems; no factor is kept for them.
 
     Args:
         matrix: symmetric, positive definite up to rounding, shape [F,F,M].
@@ -29,6 +33,23 @@ def solve(
         >>> print(solve(matrix, right, jnp.full((2, 1), 1e-6)).ravel().round(3))
         [1. 1.]
     """
+    fixed = lax.stop_gradient((matrix, minimum))
+
+    def product(x: Float[Array, "f c m"]) -> Float[Array, "f c m"]:
+        return jnp.sum(matrix[:, :, None] * x[None], axis=1)
+
+    def inverse(_: Callable[..., Array], right: Array) -> Float[Array, "f c m"]:
+        return _eliminate(fixed[0], right, fixed[1])
+
+    return lax.custom_linear_solve(product, right, inverse, symmetric=True)
+
+
+def _eliminate(
+    matrix: Float[Array, "f f m"],
+    right: Float[Array, "f c m"],
+    minimum: Float[Array, "f _"],
+) -> Float[Array, "f c m"]:
+    """The solutions, by factors of the matrix."""
     f = len(matrix)
     rest = jnp.concatenate([matrix, jnp.moveaxis(right, 1, 0)])
     columns, roots = [], []

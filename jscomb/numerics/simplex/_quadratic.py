@@ -17,12 +17,29 @@ from jscomb.numerics.simplex._active_set import (
     shared_by_equals,
     sums_to_one,
 )
+from jscomb.numerics.simplex._pivots import free_by_pivots
 from jscomb.numerics.simplex._plane import share_within
 
 _LARGEST = 1e3  # affine weight: beyond, more is lost to rounding than gained
 
 Matrix = Float[Array, "n n *batch"]
 Weights = Float[Array, "n *batch"]
+
+
+class Objective(NamedTuple):
+    """w'Kw / 2 + r.w: w'Mw up to a constant, on weights that sum to one.
+
+    Attributes:
+        matrix: K, positive definite, [N,N,M].
+        linear: r, [N,M].
+        minimum_pivot: lower bound of the pivots of K, [N,M].
+        tolerance: of a derivative, [N,M].
+    """
+
+    matrix: Float[Array, "n n m"]
+    linear: Flat
+    minimum_pivot: Flat
+    tolerance: Flat
 
 
 def quadratic(matrix: Matrix) -> Weights:
@@ -59,22 +76,37 @@ def _solve(matrix: Float[Array, "n n m"]) -> Flat:
     """Solve M problems."""
     matrix = _known(matrix)
     objective = _objective(matrix)
-    fixed = Objective(*lax.stop_gradient(tuple(objective)))
-    start = _best(matrix)
-
-    def minimise(free: Free) -> tuple[Flat, Flat]:
-        w, level = _minimum(fixed, free)
-        slope = jnp.sum(fixed.matrix * w[None], axis=1) + fixed.linear - level[None]
-        return w, slope + fixed.tolerance
-
-    active = jnp.ones(start.shape[1:], bool)
-    found, free = search(minimise, start.astype(matrix.dtype), start, active)
-    solved = sums_to_one(_minimum(fixed, free)[0])
-    w, _ = _minimum(objective, jnp.where(solved[None], free, start))
+    found, free = _found(Objective(*lax.stop_gradient(tuple(objective))), _best(matrix))
+    w, _ = _minimum(objective, free)
     feasible = jnp.all(w >= minimum_weight(w), axis=0)
     w = jnp.where(feasible[None], jnp.maximum(w, 0.0), found)
     w = _shared_by_equals(w, matrix)
     return w / jnp.sum(w, axis=0, keepdims=True)
+
+
+def _found(objective: Objective, start: Free) -> tuple[Flat, Free]:
+    """The weights, and which are free: by pivots, or where these fail by a search."""
+
+    def minimise(free: Free) -> tuple[Flat, Flat]:
+        w, level = _minimum(objective, free)
+        slope = jnp.sum(objective.matrix * w[None], axis=1) + objective.linear
+        return w, slope - level[None] + objective.tolerance
+
+    def searched(w: Flat, free: Free, solved: Array) -> tuple[Flat, Free]:
+        w = jnp.where(solved[None], w, start.astype(w.dtype))
+        free = jnp.where(solved[None], free, start)
+        w, free = search(minimise, w, free, ~solved)
+        kept = sums_to_one(minimise(free)[0])
+        return w, jnp.where(kept[None], free, start)
+
+    free = free_by_pivots(
+        objective.matrix, objective.linear, objective.tolerance, start
+    )
+    w, slope = minimise(free)
+    least = jnp.where(free, w - minimum_weight(w), slope)
+    solved = jnp.all(least >= 0, axis=0) & sums_to_one(w)
+    at_once = lambda w, free, _: (w, free)
+    return lax.cond(jnp.all(solved), at_once, searched, w, free, solved)
 
 
 def affine(matrix: Matrix) -> Weights:
@@ -134,22 +166,6 @@ def _shared_by_equals(w: Flat, matrix: Float[Array, "n n m"]) -> Flat:
     """The weights averaged over bases of equal rows."""
     equal = jnp.all(matrix[:, None] == matrix[None], axis=2)
     return shared_by_equals(jnp.unstack(w), [jnp.unstack(row) for row in equal])
-
-
-class Objective(NamedTuple):
-    """w'Kw / 2 + r.w: w'Mw up to a constant, on weights that sum to one.
-
-    Attributes:
-        matrix: K, positive definite, [N,N,M].
-        linear: r, [N,M].
-        minimum_pivot: lower bound of the pivots of K, [N,M].
-        tolerance: of a derivative, [N,M].
-    """
-
-    matrix: Float[Array, "n n m"]
-    linear: Flat
-    minimum_pivot: Flat
-    tolerance: Flat
 
 
 def _check(matrix: Matrix) -> None:
