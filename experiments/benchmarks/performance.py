@@ -5,19 +5,30 @@ function's arithmetic takes at the rates of the same run (matrix products, other
 arithmetic, exponentials; or a copy of its arguments and results if that is longer), the
 ratio of the two, the most memory that its program needs beside its arguments, the power
 of the number of pixels that time grows by, and seconds of compilation, also of the
-gradient. What has been measured is kept, and a second run goes on from there.
+gradient. With an earlier package each function's seconds before are measured beside it,
+in a process of their own. The plot shows arithmetic a second over arithmetic a byte,
+below the machine's rates. What has been measured is kept, and a second run goes on from
+there.
 """
 
+import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import math
+import multiprocessing
+import os
 import pathlib
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from experiments.benchmarks.work import Work, rates, work_of
@@ -31,6 +42,7 @@ from tests.battery import catalogue, parts
 from tests.battery.rendering import Rendering, mirrored, rendering_of
 
 LONG = 1.5  # seconds after which a warm-up makes no difference
+NOISE = 1.25  # by which times of one function differ
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,11 +53,14 @@ class Config(Options):
         results: file that costs are kept in; None to keep none.
         sizes: widths and heights in pixels, two.
         only: functions whose names begin so.
+        before: folder that has an earlier package `jscomb` alone, as
+            `pip install --no-deps --target FOLDER` makes it.
     """
 
     results: pathlib.Path | None = None
     sizes: tuple[int, int] = (1024, 2048)
     only: str = ""
+    before: pathlib.Path | None = None
 
 
 class Cost(NamedTuple):
@@ -57,6 +72,8 @@ class Cost(NamedTuple):
         memory: bytes that the program needs beside arguments and results.
         compiling: seconds, tracing included.
         compiling_gradient: likewise, of the results' sum; None where there is none.
+        operations: of its arithmetic.
+        moved: bytes of its arguments and results.
     """
 
     seconds: float
@@ -64,6 +81,23 @@ class Cost(NamedTuple):
     memory: int
     compiling: float
     compiling_gradient: float | None
+    operations: float
+    moved: float
+
+
+class Found(NamedTuple):
+    """What was measured.
+
+    Attributes:
+        costs: by function and size.
+        before: seconds of the earlier package at the larger size, by function; None
+            where it has no such function.
+        rates: of the machine.
+    """
+
+    costs: dict[str, dict[int, Cost]]
+    before: dict[str, float | None]
+    rates: Work
 
 
 def functions(*, quick: bool = False) -> dict[str, Callable[[Rendering], Any]]:
@@ -84,7 +118,7 @@ def functions(*, quick: bool = False) -> dict[str, Callable[[Rendering], Any]]:
 def measure(
     function: Callable[[Rendering], Any],
     r: Rendering,
-    best: Callable[[], Work],
+    best: Work,
     *,
     backwards: bool,
 ) -> Cost:
@@ -93,25 +127,21 @@ def measure(
     Args:
         function: to compile and call.
         r: what it is given.
-        best: the machine's rates, measured when they are first needed.
+        best: the machine's rates.
         backwards: whether it has a gradient to compile.
 
     Returns:
-        its cost; the median of some calls after the first, or that if it is long.
+        its cost.
     """
     program, compiling = _compiled(function, r)
-    start = time.perf_counter()
-    jax.block_until_ready(program(r))
-    seconds = time.perf_counter() - start
-    if seconds < LONG:
-        repeats = min(7, math.ceil(LONG / 2 / seconds))
-        seconds = medians({"": lambda: program(r)}, repeats)[""]
+    seconds = _seconds(program, r)
     memory = program.memory_analysis().temp_size_in_bytes
-    ceiling = work_of(function, r).seconds(best())
+    work = work_of(function, r)
     compiling_gradient = None
     if backwards:
         compiling_gradient = _compiled(jax.grad(_total(function)), r)[1]
-    return Cost(seconds, ceiling, memory, compiling, compiling_gradient)
+    cost = seconds, work.seconds(best), memory, compiling, compiling_gradient
+    return Cost(*cost, operations=sum(work[:3]), moved=work.moved)
 
 
 def _compiled(function: Callable[[Rendering], Any], r: Rendering) -> tuple[Any, float]:
@@ -121,37 +151,104 @@ def _compiled(function: Callable[[Rendering], Any], r: Rendering) -> tuple[Any, 
     return program, time.perf_counter() - start
 
 
+def _seconds(program: Callable[[Rendering], Any], r: Rendering) -> float:
+    """The median of some calls after the first, or that if it is long."""
+    start = time.perf_counter()
+    jax.block_until_ready(program(r))
+    seconds = time.perf_counter() - start
+    if seconds < LONG:
+        repeats = min(7, math.ceil(LONG / 2 / seconds))
+        seconds = medians({"": lambda: program(r)}, repeats)[""]
+    return seconds
+
+
 def _total(function: Callable[[Rendering], Any]) -> Callable[[Rendering], jax.Array]:
     """The sum of all that a function returns, to differentiate."""
     return lambda r: sum(map(jnp.sum, jax.tree.leaves(function(r))))
 
 
-def run(config: Config) -> dict[str, dict[int, Cost]]:
+def rendering(size: int, *, quick: bool) -> Rendering:
+    """The bundled frame.
+
+    Args:
+        size: width and height in pixels, to which it is mirrored.
+        quick: of its corner.
+
+    Returns:
+        what functions are given.
+    """
+    small = rendering_of(exr.read_frame(exr.bundled()["cornell-glass-64"]))
+    if quick:
+        small = Rendering(*(i[:32, :32] for i in small[:-1]), small.unit)
+    return mirrored(small, size)
+
+
+def seconds_here(name: str, size: int, quick: bool) -> float | None:
+    """Measure a function by this process's package.
+
+    Args:
+        name: of the function.
+        size: width and height in pixels.
+        quick: as of `rendering`.
+
+    Returns:
+        seconds; None if the package has no such function.
+    """
+    r = rendering(size, quick=quick)
+    try:
+        program, _ = _compiled(functions()[name], r)
+    except AttributeError:
+        return None
+    return _seconds(program, r)
+
+
+@contextlib.contextmanager
+def process_of(folder: pathlib.Path) -> Iterator[concurrent.futures.Executor]:
+    """A process that imports `jscomb` from a folder.
+
+    Args:
+        folder: that has the package.
+
+    Yields:
+        what runs functions there.
+    """
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as process:
+        sys.path.insert(0, str(folder))  # a new process begins with its parent's
+        process.submit(os.getpid).result()
+        sys.path.remove(str(folder))
+        yield process
+
+
+def run(config: Config) -> Found:
     """Measure what has not been measured.
 
     Args:
         config: what.
 
     Returns:
-        costs by function and size.
+        what was measured.
     """
     sizes = (32, 64) if config.quick else config.sizes
     found = functions(quick=config.quick)
     forwards = {n for n, each in catalogue.solvers().items() if not each.backwards}
-    kept, costs = Results(config.results), {}
+    kept, costs, before = Results(config.results), {}, {}
     wanted = [name for name in found if name.startswith(config.only)]
-    best = functools.cache(lambda: rates(repeats=3))
-    small = rendering_of(exr.read_frame(exr.bundled()["cornell-glass-64"]))
-    if config.quick:
-        small = Rendering(*(i[:32, :32] for i in small[:-1]), small.unit)
-    for size in sizes:
-        r = mirrored(small, size)
-        for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
-            backwards = name not in forwards
-            make = functools.partial(measure, found[name], r, best, backwards=backwards)
-            cost = kept.get(f"{name}, {size}", make)
-            costs.setdefault(name, {})[size] = Cost(*cost)
-    return costs
+    best = Work(*kept.get("rates", lambda: rates(repeats=3)))
+    with contextlib.ExitStack() as stack:
+        earlier = config.before and stack.enter_context(process_of(config.before))
+        for size in sizes:
+            r = rendering(size, quick=config.quick)
+            for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
+                of = functools.partial(measure, backwards=name not in forwards)
+                make = functools.partial(of, found[name], r, best)
+                cost = kept.get(f"{name}, {size}", make)
+                costs.setdefault(name, {})[size] = Cost(*cost)
+                if earlier and size == sizes[-1]:
+                    given = seconds_here, name, size, config.quick
+                    make = lambda given=given: earlier.submit(*given).result()
+                    before[name] = kept.get(f"{name}, {size}, before", make)
+    return Found(costs, before, best)
 
 
 class Row(NamedTuple):
@@ -159,6 +256,7 @@ class Row(NamedTuple):
 
     Attributes:
         name: of the function.
+        before: seconds a megapixel by the earlier package, if any.
         seconds: a megapixel.
         ceiling: seconds of its arithmetic or of a copy, a megapixel.
         ratio: of both.
@@ -170,6 +268,7 @@ class Row(NamedTuple):
     """
 
     name: str
+    before: float | None
     seconds: float
     ceiling: float
     ratio: float
@@ -180,12 +279,13 @@ class Row(NamedTuple):
     compiling_gradient: float | None
 
 
-def row(name: str, costs: dict[int, Cost]) -> Row:
+def row(name: str, costs: dict[int, Cost], before: float | None) -> Row:
     """One line of the table.
 
     Args:
         name: of the function.
         costs: at two sizes, the smaller first.
+        before: seconds of the earlier package, if any.
 
     Returns:
         its cells.
@@ -194,6 +294,7 @@ def row(name: str, costs: dict[int, Cost]) -> Row:
     pixels = large**2
     return Row(
         f"`{name}`",
+        before and 1e6 * before / pixels,
         1e6 * last.seconds / pixels,
         1e6 * last.ceiling / pixels,
         last.seconds / last.ceiling,
@@ -205,16 +306,51 @@ def row(name: str, costs: dict[int, Cost]) -> Row:
     )
 
 
-def report(costs: dict[str, dict[int, Cost]]) -> Report:
+def roofline(found: Found) -> Figure:
+    """Plot arithmetic a second over arithmetic a byte of arguments and results.
+
+    Args:
+        found: by `run`.
+
+    Returns:
+        the plot, with the names of what is farthest below the machine's rates.
+    """
+    last = {name: [*costs.values()][-1] for name, costs in found.costs.items()}
+    last = {name: cost for name, cost in last.items() if cost.operations}
+    x = np.array([cost.operations / cost.moved for cost in last.values()])
+    y = np.array([cost.operations / cost.seconds for cost in last.values()])
+    rooms = [name.partition(".")[0] for name in last]
+    figure, axes = plt.subplots(figsize=(10, 6))
+    for number, room in enumerate(dict.fromkeys(rooms)):
+        own, color = [each == room for each in rooms], plt.colormaps["tab20"](number)
+        axes.scatter(x[own], y[own], color=color, s=20, label=room)
+    grid = np.geomspace(min(x) / 2, max(x) * 2, 100)
+    for kind in ("products", "operations", "exponentials"):
+        roof = np.minimum(grid * found.rates.moved, getattr(found.rates, kind))
+        axes.plot(grid, roof, "k-", lw=0.8)
+        axes.text(grid[-1], roof[-1], kind, ha="right", va="bottom", fontsize=8)
+    slowest = sorted(last, key=lambda n: last[n].seconds / last[n].ceiling)[-8:]
+    for name in slowest:
+        at = [*last].index(name)
+        axes.annotate(name, (x[at], y[at]), fontsize=7, xytext=(4, -3),
+                      textcoords="offset points")  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="operations a byte",
+             ylabel="operations a second")  # fmt: skip
+    axes.legend(fontsize=7, ncols=2, loc="lower right")
+    return figure
+
+
+def report(found: Found) -> Report:
     """Say what was found.
 
     Args:
-        costs: by `run`.
+        found: by `run`.
 
     Returns:
-        a line a function.
+        a line a function, and the plot.
     """
-    rows = [row(name, cost) for name, cost in costs.items()]
+    costs, before, _ = found
+    rows = [row(name, cost, before.get(name)) for name, cost in costs.items()]
     ratios = sorted(each.ratio for each in rows)
     growth = [each.growth for each in rows]
     slowest = max(rows, key=lambda each: each.ratio)
@@ -224,11 +360,20 @@ def report(costs: dict[str, dict[int, Cost]]) -> Report:
         f"{ratios[-1]:.0f} times ({slowest.name}); time grows as the pixels to a power "
         f"of {min(growth):.2f} to {max(growth):.2f}."
     )
+    gains = [each.before / each.seconds for each in rows if each.before]
+    if gains:
+        faster = sum(gain > NOISE for gain in gains)
+        slower = sum(gain < 1 / NOISE for gain in gains)
+        answer += (
+            f" Of {len(gains)} that were there before {faster} take less than "
+            f"{1 / NOISE:.2f} of the time, {slower} more than {NOISE:.2f} times."
+        )
     sizes = list(next(iter(costs.values())))
     memory = [f"B/pixel at {size}" for size in sizes]
-    header = "function", "s/Mpx", "ceiling", "ratio", *memory, "growth"
+    header = "function", "before, s/Mpx", "s/Mpx", "ceiling", "ratio", *memory, "growth"
     header = *header, "compiling, s", "gradient compiling, s"
-    return Report(answer, table(header, rows))
+    body = table(header, rows)
+    return Report(answer, body, {"arithmetic a second": roofline(found)})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What functions cost: their work is counted right, and what was measured is kept."""
 
 import collections
+import importlib.util
 import pathlib
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jscomb
 from experiments.benchmarks import (
     accelerators,
     files,
@@ -70,8 +72,8 @@ def test_time_is_that_of_computing_or_moving():
 def test_performance_is_measured_and_kept(tmp_path, monkeypatch):
     config = performance.Config(tmp_path / "costs.jsonl", quick=True)
     found = performance.run(config)
-    assert set(found) == set(performance.functions(quick=True))
-    for costs in found.values():
+    assert set(found.costs) == set(performance.functions(quick=True))
+    for costs in found.costs.values():
         assert list(costs) == [32, 64]
         for cost in costs.values():
             assert cost.seconds > 0
@@ -85,6 +87,20 @@ def test_performance_is_measured_and_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(performance, "measure", never)
     assert performance.run(config) == found
     assert "`smoothing.box`" in performance.report(found).body
+
+
+@pytest.mark.slow
+def test_performance_of_an_earlier_package(tmp_path):
+    there = pathlib.Path(jscomb.__file__).parent
+    (tmp_path / "jscomb").symlink_to(there, target_is_directory=True)
+    with performance.process_of(tmp_path) as process:
+        spec = process.submit(importlib.util.find_spec, "jscomb").result()
+        assert pathlib.Path(spec.origin).parent == tmp_path / "jscomb"
+        given = performance.seconds_here, "smoothing.box", 32, True
+        seconds = process.submit(*given).result()
+    costs = {"smoothing.box": dict.fromkeys((16, 32), performance.Cost(*[1.0] * 7))}
+    found = performance.Found(costs, {"smoothing.box": seconds}, Work(*[1.0] * 4))
+    assert "Of 1 that were there before" in performance.report(found).answer
 
 
 @pytest.mark.slow
