@@ -3,8 +3,9 @@
 A frame is mirrored until it is as large as asked. Every tier, in a process of its own:
 the first run, which compiles, the second, the most memory that the process ever held,
 and its cost in denoisings, runs of Open Image Denoise on the frame in the same process.
-Of the last tier the share of each part: its estimates with those of both halves, the
-weights, and the estimated error.
+Beside it what rendering 64 samples a pixel of the frame's scene takes, at the smallest
+size, scaled by the pixels. Of the last tier the share of each part, at the two smallest
+sizes: its estimates with those of both halves, the weights, and the estimated error.
 """
 
 import dataclasses
@@ -21,6 +22,7 @@ from tqdm import tqdm
 
 from experiments.common.command import Options, main
 from experiments.common.report import Report
+from experiments.common.results import Results
 from experiments.common.tables import table
 from experiments.common.timing import apart
 from jscomb import ensemble, exr, metrics
@@ -28,7 +30,10 @@ from jscomb.frame import Frame
 from jscomb.methods import METHODS, TIERS, combine_tier
 from jscomb.methods._inputs import inputs, with_input
 from jscomb.numerics.tiles import compiled
+from jscomb.rendering import Settings, render
 from tests.battery.rendering import mirrored
+
+SAMPLES = 64  # a pixel, of the rendering that tiers are compared with
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,11 +42,17 @@ class Config(Options):
 
     Attributes:
         frame: EXR file.
+        results: file that costs are kept in; None to keep none.
+        scene: of the frame, as `jscomb render` takes it; None to render nothing.
         sizes: widths and heights in pixels.
+        largest: of each tier, the largest size that the memory suffices for.
     """
 
     frame: tyro.conf.Positional[pathlib.Path]
-    sizes: tuple[int, ...] = (512, 1024)
+    results: pathlib.Path | None = None
+    scene: str | None = None
+    sizes: tuple[int, ...] = (512, 1024, 2048, 4096)
+    largest: tuple[int, ...] = (4096, 2048, 2048)
 
 
 class Cost(NamedTuple):
@@ -58,6 +69,20 @@ class Cost(NamedTuple):
     first: float
     second: float
     memory: float
+
+
+class Found(NamedTuple):
+    """What was measured.
+
+    Attributes:
+        costs: by size and tier.
+        parts: seconds of each part of the last tier, by size.
+        rendering: seconds of 64 samples of a megapixel, if a scene was given.
+    """
+
+    costs: dict[tuple[int, str], Cost]
+    parts: dict[int, dict[str, float]]
+    rendering: float | None
 
 
 def seconds(make: Callable[[], Any]) -> float:
@@ -119,56 +144,71 @@ def parts(path: pathlib.Path, size: int, tier: str) -> dict[str, float]:
     return found
 
 
-def run(config: Config) -> tuple[dict[tuple[int, str], Cost], dict[int, dict]]:
+def rendering(scene: str, size: int) -> float:
+    """Seconds a megapixel of 64 samples; the renderer's programs are there already."""
+    settings = Settings(spp=SAMPLES, size=size)
+    render(scene, dataclasses.replace(settings, spp=2))
+    return seconds(lambda: render(scene, settings).color) / (size / 1000) ** 2
+
+
+def run(config: Config) -> Found:
     """Measure all tiers at all sizes.
 
     Args:
         config: what to measure.
 
     Returns:
-        costs by size and tier; seconds of the parts of the last tier by size.
+        costs, parts of the last tier, and the time of rendering.
     """
-    sizes, tiers = config.sizes, [*TIERS]
+    sizes, tiers = config.sizes, dict(zip(TIERS, config.largest, strict=True))
     if config.quick:
-        sizes, tiers = (96,), tiers[:1]
-    found = {
-        (size, tier): apart(cost, config.frame, size, tier)
-        for size in tqdm(sizes, unit="size")
-        for tier in tiers
-    }
-    return found, {s: apart(parts, config.frame, s, tiers[-1]) for s in sizes}
+        sizes, tiers = (96,), {"fast": 96}
+    kept, costs, parts_of, rendered = Results(config.results), {}, {}, None
+
+    def measured(function: Callable, *arguments: Any) -> Any:
+        key = " ".join(map(str, (function.__name__, *arguments)))
+        return kept.get(key, lambda: apart(function, *arguments))
+
+    for size in tqdm(sizes, unit="size"):
+        for tier, largest in tiers.items():
+            if size <= largest:
+                of = measured(cost, config.frame, size, tier)
+                costs[size, tier] = Cost(*of)
+        if size in sizes[:2]:
+            parts_of[size] = measured(parts, config.frame, size, [*tiers][-1])
+    if config.scene:
+        rendered = measured(rendering, config.scene, sizes[0])
+    return Found(costs, parts_of, rendered)
 
 
-def report(result: tuple[dict[tuple[int, str], Cost], dict[int, dict]]) -> Report:
+def report(found: Found) -> Report:
     """Say what tiers cost.
 
     Args:
-        result: by `run`.
+        found: by `run`.
 
     Returns:
         a line a tier and size, and a line a part.
     """
-    found, shares = result
+    costs, shares, rendered = found
     rows = [
-        [size, tier, c.second / c.denoising, c.second, c.first, c.denoising, c.memory]
-        for (size, tier), c in found.items()
+        [
+            *(size, tier, c.second / c.denoising, c.second, c.first, c.denoising),
+            rendered and rendered * (size / 1000) ** 2,
+            c.memory,
+        ]
+        for (size, tier), c in costs.items()
     ]
-    largest = max(size for size, _ in found)
+    sizes = [size for size, _ in costs]
+    largest = max(size for size in sizes if sizes.count(size) == sizes.count(sizes[0]))
     said = [
         f"{tier} {c.second / c.denoising:.3g}"
-        for (size, tier), c in found.items()
+        for (size, tier), c in costs.items()
         if size == largest
     ]
     answer = f"At {largest}x{largest}, in denoisings: {', '.join(said)}."
-    header = [
-        "size",
-        "tier",
-        "denoisings",
-        "s",
-        "first run s",
-        "one denoising s",
-        "MiB",
-    ]
+    header = ["size", "tier", "denoisings", "s", "first run s", "one denoising s"]
+    header += [f"rendering {SAMPLES} samples s", "MiB"]
     of_parts = [
         [name, *(p[name] / sum(p.values()) for p in shares.values())]
         for name in next(iter(shares.values()))

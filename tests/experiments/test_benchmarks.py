@@ -153,12 +153,13 @@ def test_files_are_read_and_written_beside_openexr():
 @pytest.mark.slow
 def test_tiers_cost_what_their_parts_do():
     frame = DATA / "cornell-glass-64.exr"
-    found, parts = tiers.run(tiers.Config(frame, quick=True))
-    ((size, tier), cost), *_ = found.items()
+    found = tiers.run(tiers.Config(frame, quick=True))
+    ((size, tier), cost), *_ = found.costs.items()
     assert (size, tier) == (96, "fast")
     assert 0 < cost.second < cost.first
-    assert parts[96].keys() >= {"oidn", "weights"}
-    said = tiers.report((found, parts))
+    assert found.parts[96].keys() >= {"oidn", "weights"}
+    said = tiers.report(found._replace(rendering=10.0))
+    assert "| 0.0922 |" in said.body  # of 96x96 pixels
     assert f"fast {cost.second / cost.denoising:.3g}" in said.answer
 
 
