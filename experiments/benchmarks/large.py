@@ -40,7 +40,7 @@ class Config(Options):
     """
 
     frame: tyro.conf.Positional[pathlib.Path]
-    sizes: tuple[int, ...] = (1024, 2048, 4096)
+    sizes: tuple[int, ...] = (1024, 2048, 8192)
     methods: tuple[str, ...] = ("whitened", "njs")
     budget: int = 512
     whole: int = 2048
@@ -74,11 +74,12 @@ def enlarged(frame: Frame, size: int) -> Frame:
         size: in pixels.
 
     Returns:
-        the frame, mirrored at its borders; its biased image without halves, so that no
-        method makes it anew.
+        the frame, mirrored at its borders, as one buffer: four would fill the memory.
+        Its biased image is without halves, so that no method makes it anew.
     """
     y = frame.estimates["oidn"]._replace(halves=None)
-    return mirrored(frame._replace(estimates={"oidn": y}, reference=None), size)
+    alone = frame._replace(estimates={"oidn": y}, reference=None).merged(1)
+    return mirrored(alone, size)
 
 
 def measure(
