@@ -91,6 +91,8 @@ def inside(equation: core.JaxprEqn) -> list[core.Jaxpr]:
     """Return the programs that an equation runs."""
     if equation.primitive.name.startswith(("reduce", "scatter", "cum", "sort", "arg")):
         return []  # what it does to two numbers
+    if equation.primitive.name == "custom_linear_solve":
+        return [equation.params["jaxprs"].solve.jaxpr]  # forward, not its transpose
     found = []
     for value in equation.params.values():
         for each in value if isinstance(value, tuple | list) else (value,):

@@ -14,6 +14,7 @@ from jscomb.numerics.guards import (
     safe_sqrt,
     zero_invalid,
 )
+from jscomb.numerics.linear import channel_mean, channel_sum
 from jscomb.numerics.tiles import in_one_pass
 from jscomb.numerics.windows import at_window_max, check_window, separable_sum
 from jscomb.progressive._estimate import mixing
@@ -138,7 +139,7 @@ def bound_mixing(
     valid, alpha, x, y, v = zero_invalid(mixing, unbiased, biased, variance)
     if sigma is None:
         sigma = bound_sigma(unbiased, variance, noise=noise)
-    moved = jnp.mean(alpha * (y - x), axis=-1, keepdims=True)
+    moved = channel_mean(alpha * (y - x))
     noise = _of_mean(v) if noise is None else jnp.where(valid, noise, 0.0)
     largest = at_window_max(
         noise, jnp.concatenate([moved, noise], axis=-1), window, mask=valid
@@ -201,14 +202,14 @@ def bound_sigma(
     if width == "image mean":
         square = square / count
     if width == "relative":
-        radiance = jnp.sum(jnp.abs(jnp.mean(x, axis=-1))) / count
+        radiance = jnp.sum(jnp.abs(channel_mean(x))) / count
         square = divide(square, jnp.square(radiance), where=radiance > 0)
     return jnp.clip(_WIDEST * safe_sqrt(square), _NARROWEST, _WIDEST)
 
 
 def _of_mean(variance: Variance) -> Noise:
     """Variance of the mean of independent channels."""
-    return jnp.sum(variance, axis=-1, keepdims=True) / variance.shape[-1] ** 2
+    return channel_sum(variance) / variance.shape[-1] ** 2
 
 
 def _kernel(sigma: Scalar, window: int) -> Float[Array, " taps"]:
