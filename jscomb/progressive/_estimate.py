@@ -10,6 +10,8 @@ from jscomb.typing import Image, Variance
 # What one pixel may weigh, times the rounding error: finite however small its variance.
 _MAXIMUM_EVIDENCE = 1e4
 
+MIXING_WINDOW = 15  # width of the windows in pixels
+
 
 def mixing(
     unbiased: Image,
@@ -17,7 +19,7 @@ def mixing(
     variance: Variance,
     sure: Image,
     *,
-    window: int = 15,
+    window: int = MIXING_WINDOW,
     whiten: bool = False,
 ) -> Image:
     """Return the mixing of minimum estimated error over windows.
@@ -46,7 +48,20 @@ def mixing(
     Source: PD eq. 9, 10, summed over windows and channels alike.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
-    _, x, y, v, s = zero_invalid(unbiased, biased, variance, sure)
+    _, *images = zero_invalid(unbiased, biased, variance, sure)
+    return mixing_of_valid(*images, window=window, whiten=whiten)
+
+
+def mixing_of_valid(
+    x: Image,
+    y: Image,
+    v: Variance,
+    s: Image,
+    *,
+    window: int = MIXING_WINDOW,
+    whiten: bool = False,
+) -> Image:
+    """`mixing` of images that are 0 at invalid pixels."""
     square, saved = jnp.square(y - x), v - s
     if whiten:
         maximum = _MAXIMUM_EVIDENCE / float(jnp.finfo(v.dtype).eps)
