@@ -29,6 +29,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jscomb.numerics.guards import check_image, check_static, weighted_ratio
 from jscomb.numerics.linear import with_transpose
+from jscomb.numerics.tiles import in_memory
 from jscomb.typing import Image, Mask
 
 __all__ = [
@@ -98,8 +99,8 @@ def window_mean(
     if sigma is None:
         total, weight = window_sum(image, window), window_sum(ones, window)
     else:
-        kernel = gaussian_kernel(window, sigma)
-        total, weight = (separable_sum(i, kernel) for i in (image, ones))
+        total = separable_sum(image, kernel := gaussian_kernel(window, sigma))
+        (weight,) = in_memory(separable_sum(ones, kernel))  # once for all channels
     return weighted_ratio(total, weight)
 
 
@@ -252,10 +253,9 @@ def separable_sum(
     image = _only(image, mask, 0.0)
     if isinstance(kernel, Tracer):  # it may have a derivative
         return _separable(image, kernel)
-    taps = np.asarray(kernel, image.dtype)
-    kernels = jnp.asarray(taps), jnp.asarray(taps[::-1])
-    total, transpose = (functools.partial(_separable, kernel=k) for k in kernels)
-    return with_transpose(total, transpose, image)
+    taps = jnp.asarray(np.asarray(kernel), image.dtype)
+    of = lambda taps: functools.partial(_separable, kernel=taps)
+    return with_transpose(of(taps), of(taps[::-1]), image)
 
 
 def window_count(

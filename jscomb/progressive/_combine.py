@@ -16,7 +16,7 @@ from jscomb.numerics.guards import (
     zero_invalid,
 )
 from jscomb.numerics.linear import channel_mean, channel_sum
-from jscomb.numerics.tiles import in_one_pass
+from jscomb.numerics.tiles import in_memory, in_one_pass
 from jscomb.numerics.windows import at_window_max, check_window, separable_sum
 from jscomb.progressive._estimate import mixing_of_valid
 from jscomb.typing import Image, Mask, Scalar, Variance
@@ -172,7 +172,7 @@ def _bounded(
         sigma = _sigma(valid, x, noise)
     moved = channel_mean(alpha * (y - x))
     # In memory, or the pads of each window would compute them anew.
-    moved, noise = in_one_pass(lambda *arrays: arrays, moved, noise)
+    moved, noise = in_memory(moved, noise)
     largest = at_window_max(
         noise, jnp.concatenate([moved, noise], axis=-1), window, mask=valid
     )

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, zero_invalid
+from jscomb.numerics.linear import channel_sum
 from jscomb.numerics.windows import window_sum
 from jscomb.typing import Image, Variance
 
@@ -143,12 +144,12 @@ def channel_variance(
     """
     check_same_shape(half_a=half_a, half_b=half_b, variance=variance)
     valid, a, b, v = zero_invalid(half_a, half_b, variance)
-    d, over_channels = a - b, {"axis": -1, "keepdims": True}
-    energy, total = jnp.sum(jnp.square(d), **over_channels), jnp.sum(v, **over_channels)
+    d = a - b
+    energy, total = channel_sum(jnp.square(d)), channel_sum(v)
     # Relative to the variance, so that bright pixels do not decide for their windows.
     alike, each = (
         window_sum(divide(e, total, where=total > 0), window)
-        for e in (jnp.square(jnp.sum(d, **over_channels)), energy)
+        for e in (jnp.square(channel_sum(d)), energy)
     )
     # Where the halves are equal nothing is known, and the most is assumed.
     c = float(d.shape[-1])
