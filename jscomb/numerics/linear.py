@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-__all__ = ["channel_mean", "channel_sum", "with_transpose"]
+from jscomb.typing import Image
+
+__all__ = ["channel_mean", "channel_sum", "stack_sum", "with_transpose"]
 
 Values = Float[Array, "..."]
 
@@ -49,7 +51,6 @@ def with_transpose(
     return lax.custom_linear_solve(same, image, forward, backward)
 
 
-@jax.custom_jvp
 def channel_sum(image: Float[Array, "*n c"]) -> Float[Array, "*n 1"]:
     """Sum over the channels of each pixel.
 
@@ -66,16 +67,37 @@ def channel_sum(image: Float[Array, "*n c"]) -> Float[Array, "*n 1"]:
         >>> print(channel_sum(jnp.array([[1.0, 2.0, 3.0]])))
         [[6.]]
     """
-    channels = jnp.split(image, image.shape[-1], axis=-1)
-    return functools.reduce(operator.add, channels)
+    return _sum(image, -1)
 
 
-@channel_sum.defjvp
-def _channel_sum_jvp(
-    primals: tuple[Array], tangents: tuple[Array]
+def stack_sum(stack: Float[Array, "n h w c"]) -> Image:
+    """Sum a stack of images, as `channel_sum` sums channels.
+
+    Args:
+        stack: any unit, shape [N,H,W,C].
+
+    Returns:
+        the sum, shape [H,W,C].
+
+    Example:
+        >>> print(stack_sum(jnp.arange(4.0).reshape(2, 1, 2, 1))[0, :, 0])
+        [2. 4.]
+    """
+    return _sum(stack, 0)[0]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _sum(array: Array, axis: int) -> Array:
+    """Sum over slices, of one element along the axis each."""
+    return functools.reduce(operator.add, jnp.split(array, array.shape[axis], axis))
+
+
+@_sum.defjvp
+def _sum_jvp(
+    axis: int, primals: tuple[Array], tangents: tuple[Array]
 ) -> tuple[Array, Array]:
-    """Its transpose repeats the channel, that of slices pads them."""
-    return channel_sum(*primals), jnp.sum(*tangents, axis=-1, keepdims=True)
+    """Its transpose repeats an element, that of slices pads them."""
+    return _sum(*primals, axis), jnp.sum(*tangents, axis=axis, keepdims=True)
 
 
 def channel_mean(image: Float[Array, "*n c"]) -> Float[Array, "*n 1"]:
