@@ -198,6 +198,22 @@ def test_a_sum_is_its_own_derivative(window):
     )
 
 
+@pytest.mark.parametrize("traced", [False, True])
+def test_a_kernel_reversed_is_the_derivative(traced):
+    image, weights = (jnp.asarray(images((6, 7, 2), seed)) for seed in (3, 4))
+    kernel = jnp.array([1.0, 3.0, -2.0])
+    fixed = jax.jit(lambda image: windows.separable_sum(image, kernel))
+    given = lambda image: jax.jit(windows.separable_sum)(image, kernel)
+    function = given if traced else fixed
+    _, transpose = jax.vjp(function, image)
+    np.testing.assert_allclose(
+        *transpose(weights), windows.separable_sum(weights, kernel[::-1]), atol=1e-12
+    )
+    check_grads(function, (image,), order=2, modes=["fwd", "rev"])
+    mapped = jax.vmap(jax.grad(lambda i: jnp.sum(function(i) * weights)))(image[None])
+    np.testing.assert_allclose(mapped[0], *transpose(weights), atol=1e-12)
+
+
 SHARDED = """
 import re
 import os

@@ -23,6 +23,7 @@ from jscomb.numerics.guards import (
     weighted_ratio,
     zero_invalid,
 )
+from jscomb.numerics.tiles import in_memory
 from jscomb.numerics.windows import block_sum, window_sum
 from jscomb.typing import Image, Scalar
 
@@ -211,6 +212,7 @@ def prior_error(
     share = factors(v, m, jnp.zeros_like(v))
     blend = share.blend(u, b)
     excess, level = jnp.square(blend - p) - share.error, jnp.square(p)
+    excess, blend = in_memory(excess, blend)
     size = (jnp.square(blend) + level) / 2
     eta = jnp.maximum(_pooled(excess, level, size, window), 0.0)
     return jnp.where(level > 0, eta, size)

@@ -13,6 +13,7 @@ from jscomb.ensemble._evidence import Bases, check_bases
 from jscomb.ensemble._filter import Filter, Guide, filter_weights
 from jscomb.numerics import simplex
 from jscomb.numerics.guards import first_finite, zero_invalid
+from jscomb.numerics.linear import stack_sum
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Key, Variance
 
@@ -291,5 +292,5 @@ def spread(biased: Bases, weights: Bases) -> Image:
         [3.]
     """
     valid, clean = zero_invalid(biased)
-    distance = jnp.square(clean - average(clean, weights)[None])
-    return jnp.where(valid, jnp.sum(weights * distance, axis=0), 0.0)
+    distance = jnp.square(clean - stack_sum(weights * clean)[None])
+    return jnp.where(valid, stack_sum(weights * distance), 0.0)

@@ -28,6 +28,8 @@ from jscomb.numerics.guards import (
     weighted_ratio,
     zero_invalid,
 )
+from jscomb.numerics.linear import channel_mean
+from jscomb.numerics.tiles import in_memory
 from jscomb.numerics.windows import gaussian_kernel, reach_of, separable_sum
 from jscomb.typing import Image, Scalar, Variance
 
@@ -81,7 +83,7 @@ def combine_bands(
     if not sigmas or min(np.diff([0.0, *sigmas])) <= 0:
         raise ValueError(f"sigmas must be positive and ascend, got {[*sigmas]}")
     valid, x, y, v = zero_invalid(unbiased, biased, variance)
-    bright = jnp.mean(y, axis=-1, keepdims=True)
+    bright = channel_mean(y)
     if epsilon is None:
         epsilon = 0.01 * jnp.square(masked_mean(bright, valid))
     square = jnp.square(bright) + epsilon
@@ -89,13 +91,13 @@ def combine_bands(
     some = valid & (scale > 0)
     difference = divide(x - y, scale, where=some)
     noise = divide(v, jnp.broadcast_to(square, v.shape), where=some)
-    noise = jnp.mean(noise, axis=-1, keepdims=True)
+    difference, noise = in_memory(difference, channel_mean(noise))
 
     gaussians = [_gaussian(sigma) for sigma in sigmas]
     kernels = [np.ones(1), *gaussians]
     around = [gaussians[-1], *gaussians]
     ones = valid.astype(x.dtype)
-    mass = [separable_sum(ones, kernel) for kernel in kernels]
+    mass = in_memory(*(separable_sum(ones, kernel) for kernel in kernels))
     filtered = [
         weighted_ratio(separable_sum(difference, kernel), weight)
         for kernel, weight in zip(kernels, mass, strict=True)
@@ -114,9 +116,9 @@ def combine_bands(
         if k + 1 < len(kernels):
             band = band - filtered[k + 1]
             spread += covariance(k + 1, k + 1) - 2 * covariance(k, k + 1)
-        power = jnp.mean(jnp.square(band), axis=-1, keepdims=True)
+        power = channel_mean(jnp.square(band))
         power, spread = (separable_sum(i * ones, kernel) for i in (power, spread))
-        ratio = divide(spread, power, where=power > 0, otherwise=1.0)
+        (ratio,) = in_memory(divide(spread, power, where=power > 0, otherwise=1.0))
         kept += jnp.clip(1 - t * ratio, 0.0, 1.0) * band
     return jnp.where(valid, y + scale * kept, first_finite(biased, unbiased))
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jscomb.metrics._errors import counted, mean
+from jscomb.numerics.tiles import in_memory
 from jscomb.numerics.windows import window_mean
 from jscomb.typing import Image, Mask, Scalar
 
@@ -80,7 +81,7 @@ def ssim(image: Image, reference: Image, *, mask: Mask | None = None) -> Scalar:
 
     Source: Wang et al. 2004, "Image quality assessment".
     """
-    a, r = _displayed(mask, image=image, reference=reference)
+    a, r = in_memory(*_displayed(mask, image=image, reference=reference))
 
     def local(i: Image) -> Image:
         return window_mean(i, _SSIM_WINDOW, mask=mask, sigma=_SSIM_SIGMA)

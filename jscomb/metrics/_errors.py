@@ -11,6 +11,7 @@ from jscomb.numerics.guards import (
     safe_sqrt,
     zero_invalid,
 )
+from jscomb.numerics.linear import channel_mean
 from jscomb.typing import Image, Mask, Scalar
 
 
@@ -78,7 +79,7 @@ def rel_l2_map(
         ['0.0099', '0.9901']
     """
     check_same_shape(image=image, reference=reference)
-    square = jnp.mean(jnp.square(image - reference), axis=-1, keepdims=True)
+    square = channel_mean(jnp.square(image - reference))
     return square / (grey_square(reference) + epsilon)
 
 
@@ -179,7 +180,7 @@ def mean_change(
     check_same_shape(square=square, baseline=baseline)
     valid, square, baseline = zero_invalid(square, baseline)
     weight = grey_square(baseline) + epsilon
-    change = jnp.mean(square / weight, axis=-1, keepdims=True)
+    change = channel_mean(square / weight)
     average = mean(change, valid)
     spread = mean(jnp.square(change - average), valid)
     return Change(average, safe_sqrt(spread / jnp.sum(valid).astype(spread.dtype)))
@@ -243,7 +244,7 @@ def smape(
 
 def grey_square(image: Image) -> Array:
     """Squared mean of a pixel's channels, [H,W,1]."""
-    return jnp.square(jnp.mean(image, axis=-1, keepdims=True))
+    return jnp.square(channel_mean(image))
 
 
 def counted(mask: Mask | None, **images: Image) -> tuple[Image, ...]:

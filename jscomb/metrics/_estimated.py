@@ -12,6 +12,7 @@ from jscomb.numerics.guards import (
     safe_sqrt,
     zero_invalid,
 )
+from jscomb.numerics.linear import channel_mean
 from jscomb.numerics.windows import block_sum, window_mean
 from jscomb.typing import Image, Scalar
 
@@ -88,11 +89,10 @@ def estimate_error(
     noise, change = jnp.square(x_a - x_b), jnp.square(z_a - z_b) / 4
     error = (jnp.square(z_a - x_b) + jnp.square(z_b - x_a) - noise) / 2 - change
     weight = grey_square(z) + epsilon
-    relative = lambda square: jnp.where(
-        valid, jnp.mean(square, axis=-1, keepdims=True) / weight, 0.0
-    )
-    around = lambda i: window_mean(relative(i), _WINDOW, mask=valid, sigma=_SIGMA)
-    shape, noise, error = around(spread + change), around(noise / 2), relative(error)
+    relative = lambda square: jnp.where(valid, channel_mean(square) / weight, 0.0)
+    both = jnp.concatenate([relative(spread + change), relative(noise / 2)], axis=-1)
+    around = window_mean(both, _WINDOW, mask=valid, sigma=_SIGMA)
+    shape, noise, error = around[..., :1], around[..., 1:], relative(error)
     level = mean(shape, valid)
     square = level + noise
     some = valid & (square > 0)

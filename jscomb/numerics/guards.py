@@ -5,6 +5,8 @@ channels: every window excludes it, and the output there is the first finite of 
 unbiased), else 0. Layout: images [H,W,C].
 """
 
+import functools
+import operator
 from collections.abc import Iterable
 
 import jax
@@ -177,8 +179,13 @@ def finite(*images: Float[Array, "h w _"]) -> Mask:
         >>> print(finite(jnp.array([[[1.0, jnp.nan], [1.0, 2.0]]]))[..., 0])
         [[False  True]]
     """
-    masks = [jnp.all(jnp.isfinite(i), axis=-1, keepdims=True) for i in images]
-    return jnp.all(jnp.stack(masks), axis=0)
+    by_channels: dict[int, list[Array]] = {}
+    for image in images:
+        by_channels.setdefault(image.shape[-1], []).append(jnp.isfinite(image))
+    # One reduction for all images of as many channels, in one loop.
+    masks = (functools.reduce(operator.and_, each) for each in by_channels.values())
+    each = (jnp.all(mask, axis=-1, keepdims=True) for mask in masks)
+    return functools.reduce(operator.and_, each)
 
 
 def zero_invalid(*images: Float[Array, "..."]) -> tuple[Mask, *tuple[Array, ...]]:

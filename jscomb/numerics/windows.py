@@ -17,15 +17,19 @@ CPU. Gaussian weights have no such form, nor have those of `kernels`, which diff
 pixel to pixel: sharded by rows they exchange pixels once for every row of the window.
 """
 
+import functools
 import math
 from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jscomb.numerics.guards import check_image, check_static, weighted_ratio
+from jscomb.numerics.linear import with_transpose
+from jscomb.numerics.tiles import in_memory
 from jscomb.typing import Image, Mask
 
 __all__ = [
@@ -64,9 +68,10 @@ def window_sum(image: Image, window: int, *, mask: Mask | None = None) -> Image:
         [[4. 6. 4.]
          [4. 6. 4.]]
     """
-    image = _only(image, mask, 0.0)
-    columns = _add_columns(image, check_window(window))
-    return _add_rows(columns, window)
+    check_window(window)
+    total = lambda image: _add_rows(_add_columns(image, window), window)
+    # Its own transpose: a pixel is in the windows of those that are in its own.
+    return with_transpose(total, total, _only(image, mask, 0.0))
 
 
 def window_mean(
@@ -94,8 +99,8 @@ def window_mean(
     if sigma is None:
         total, weight = window_sum(image, window), window_sum(ones, window)
     else:
-        kernel = gaussian_kernel(window, sigma)
-        total, weight = (separable_sum(i, kernel) for i in (image, ones))
+        total = separable_sum(image, kernel := gaussian_kernel(window, sigma))
+        (weight,) = in_memory(separable_sum(ones, kernel))  # once for all channels
     return weighted_ratio(total, weight)
 
 
@@ -245,18 +250,12 @@ def separable_sum(
         [[ 9. 12.  9.]
          [ 9. 12.  9.]]
     """
-    kernel = jnp.asarray(kernel, image.dtype)
-    r = check_window(len(kernel)) // 2
     image = _only(image, mask, 0.0)
-    for axis in (1, 0):
-        size = image.shape[axis]
-        ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
-        padded = jnp.pad(image, ends)
-        image = sum(
-            weight * lax.slice_in_dim(padded, k, k + size, axis=axis)
-            for k, weight in enumerate(kernel)
-        )  # type: ignore[assignment]
-    return image
+    if isinstance(kernel, Tracer):  # it may have a derivative
+        return _separable(image, kernel)
+    taps = jnp.asarray(np.asarray(kernel), image.dtype)
+    of = lambda taps: functools.partial(_separable, kernel=taps)
+    return with_transpose(of(taps), of(taps[::-1]), image)
 
 
 def window_count(
@@ -342,6 +341,20 @@ def _ones(image: Image, mask: Mask | None) -> Float[Array, "h w 1"]:
     """Return 1 at included pixels, 0 elsewhere."""
     ones = jnp.ones_like(image[..., :1])
     return ones if mask is None else mask.astype(image.dtype)
+
+
+def _separable(image: Image, kernel: Float[Array, " taps"]) -> Image:
+    """Sum over the columns, then the rows about each pixel, with weights."""
+    r = check_window(len(kernel)) // 2
+    for axis in (1, 0):
+        size = image.shape[axis]
+        ends = [(r, r) if a == axis else (0, 0) for a in range(3)]
+        padded = jnp.pad(image, ends)
+        image = sum(
+            weight * lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k, weight in enumerate(kernel)
+        )  # type: ignore[assignment]
+    return image
 
 
 def _add_columns(image: Image, window: int) -> Image:

@@ -10,14 +10,16 @@ from jaxtyping import Array, Float
 from jscomb.numerics.guards import (
     check_same_shape,
     divide,
+    finite,
     first_finite,
     safe_sqrt,
     zero_invalid,
 )
-from jscomb.numerics.tiles import in_one_pass
+from jscomb.numerics.linear import channel_mean, channel_sum
+from jscomb.numerics.tiles import in_memory, in_one_pass
 from jscomb.numerics.windows import at_window_max, check_window, separable_sum
-from jscomb.progressive._estimate import mixing
-from jscomb.typing import Image, Scalar, Variance
+from jscomb.progressive._estimate import mixing_of_valid
+from jscomb.typing import Image, Mask, Scalar, Variance
 
 Width = Literal["relative", "absolute", "image mean"]
 Mixing = Callable[[Image, Image, Variance, Image], Image]
@@ -25,6 +27,7 @@ Mixing = Callable[[Image, Image, Variance, Image], Image]
 _NARROWEST, _WIDEST = 1e-3, 100.0  # of the bound's Gaussian, in pixels
 
 BOUND_WINDOW = 11  # width of the bound's windows in pixels
+_STRENGTH, _SHIFT = 2.0, 4.2  # a and c
 
 Noise = Float[Array, "h w 1"]
 
@@ -72,12 +75,15 @@ def combine(
     Source: PD eq. 11, 18.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
-    alpha = (mix or mixing)(unbiased, biased, variance, sure)
+    valid, x, y, v, s = zero_invalid(unbiased, biased, variance, sure)
+    if mix is None:
+        alpha = mixing_of_valid(x, y, v, s)
+    else:
+        alpha = mix(unbiased, biased, variance, sure)
     if bound:
-        alpha = bound_mixing(
-            alpha, unbiased, biased, variance, noise=noise, sigma=sigma
-        )
-    valid, x, y, _, _ = zero_invalid(unbiased, biased, variance, sure)
+        known = valid & finite(alpha)
+        alpha = jnp.where(known, alpha, 0.0)
+        alpha = _bounded(known, alpha, x, y, v, noise=noise, sigma=sigma)
     # As a blend, not x + alpha (y - x), so that 0 and 1 are exact.
     blend = (1 - alpha) * x + alpha * y
     return jnp.where(valid, blend, first_finite(biased, unbiased))
@@ -92,8 +98,8 @@ def bound_mixing(
     noise: Noise | None = None,
     sigma: Scalar | None = None,
     window: int = BOUND_WINDOW,
-    strength: float = 2.0,
-    shift: float = 4.2,
+    strength: float = _STRENGTH,
+    shift: float = _SHIFT,
 ) -> Image:
     """Lower the mixing where it changes the image by more than the noise explains.
 
@@ -135,11 +141,38 @@ def bound_mixing(
     Source: PD eq. 12-18.
     """
     check_same_shape(mixing=mixing, unbiased=unbiased, biased=biased, variance=variance)
-    valid, alpha, x, y, v = zero_invalid(mixing, unbiased, biased, variance)
-    if sigma is None:
-        sigma = bound_sigma(unbiased, variance, noise=noise)
-    moved = jnp.mean(alpha * (y - x), axis=-1, keepdims=True)
+    valid, *images = zero_invalid(mixing, unbiased, biased, variance)
+    return _bounded(
+        valid,
+        *images,
+        noise=noise,
+        sigma=sigma,
+        window=window,
+        strength=strength,
+        shift=shift,
+    )
+
+
+def _bounded(
+    valid: Mask,
+    alpha: Image,
+    x: Image,
+    y: Image,
+    v: Variance,
+    *,
+    noise: Noise | None,
+    sigma: Scalar | None,
+    window: int = BOUND_WINDOW,
+    strength: float = _STRENGTH,
+    shift: float = _SHIFT,
+) -> Image:
+    """`bound_mixing` of images that are 0 at invalid pixels."""
     noise = _of_mean(v) if noise is None else jnp.where(valid, noise, 0.0)
+    if sigma is None:
+        sigma = _sigma(valid, x, noise)
+    moved = channel_mean(alpha * (y - x))
+    # In memory, or the pads of each window would compute them anew.
+    moved, noise = in_memory(moved, noise)
     largest = at_window_max(
         noise, jnp.concatenate([moved, noise], axis=-1), window, mask=valid
     )
@@ -196,19 +229,24 @@ def bound_sigma(
         raise ValueError(f"width must be one of {get_args(Width)}, got {width!r}")
     valid, x, v = zero_invalid(unbiased, variance)
     noise = _of_mean(v) if noise is None else jnp.where(valid, noise, 0.0)
+    return _sigma(valid, x, noise, width=width)
+
+
+def _sigma(valid: Mask, x: Image, noise: Noise, *, width: Width = "relative") -> Scalar:
+    """`bound_sigma` of images that are 0 at invalid pixels."""
     count = jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
     square = jnp.sum(noise) / count
     if width == "image mean":
         square = square / count
     if width == "relative":
-        radiance = jnp.sum(jnp.abs(jnp.mean(x, axis=-1))) / count
+        radiance = jnp.sum(jnp.abs(channel_mean(x))) / count
         square = divide(square, jnp.square(radiance), where=radiance > 0)
     return jnp.clip(_WIDEST * safe_sqrt(square), _NARROWEST, _WIDEST)
 
 
 def _of_mean(variance: Variance) -> Noise:
     """Variance of the mean of independent channels."""
-    return jnp.sum(variance, axis=-1, keepdims=True) / variance.shape[-1] ** 2
+    return channel_sum(variance) / variance.shape[-1] ** 2
 
 
 def _kernel(sigma: Scalar, window: int) -> Float[Array, " taps"]:

@@ -4,11 +4,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import check_same_shape, divide, zero_invalid
+from jscomb.numerics.linear import channel_sum
 from jscomb.numerics.windows import window_sum
 from jscomb.typing import Image, Variance
 
 # What one pixel may weigh, times the rounding error: finite however small its variance.
 _MAXIMUM_EVIDENCE = 1e4
+
+MIXING_WINDOW = 15  # width of the windows in pixels
 
 
 def mixing(
@@ -17,7 +20,7 @@ def mixing(
     variance: Variance,
     sure: Image,
     *,
-    window: int = 15,
+    window: int = MIXING_WINDOW,
     whiten: bool = False,
 ) -> Image:
     """Return the mixing of minimum estimated error over windows.
@@ -46,7 +49,20 @@ def mixing(
     Source: PD eq. 9, 10, summed over windows and channels alike.
     """
     check_same_shape(unbiased=unbiased, biased=biased, variance=variance, sure=sure)
-    _, x, y, v, s = zero_invalid(unbiased, biased, variance, sure)
+    _, *images = zero_invalid(unbiased, biased, variance, sure)
+    return mixing_of_valid(*images, window=window, whiten=whiten)
+
+
+def mixing_of_valid(
+    x: Image,
+    y: Image,
+    v: Variance,
+    s: Image,
+    *,
+    window: int = MIXING_WINDOW,
+    whiten: bool = False,
+) -> Image:
+    """`mixing` of images that are 0 at invalid pixels."""
     square, saved = jnp.square(y - x), v - s
     if whiten:
         maximum = _MAXIMUM_EVIDENCE / float(jnp.finfo(v.dtype).eps)
@@ -128,12 +144,12 @@ def channel_variance(
     """
     check_same_shape(half_a=half_a, half_b=half_b, variance=variance)
     valid, a, b, v = zero_invalid(half_a, half_b, variance)
-    d, over_channels = a - b, {"axis": -1, "keepdims": True}
-    energy, total = jnp.sum(jnp.square(d), **over_channels), jnp.sum(v, **over_channels)
+    d = a - b
+    energy, total = channel_sum(jnp.square(d)), channel_sum(v)
     # Relative to the variance, so that bright pixels do not decide for their windows.
     alike, each = (
         window_sum(divide(e, total, where=total > 0), window)
-        for e in (jnp.square(jnp.sum(d, **over_channels)), energy)
+        for e in (jnp.square(channel_sum(d)), energy)
     )
     # Where the halves are equal nothing is known, and the most is assumed.
     c = float(d.shape[-1])

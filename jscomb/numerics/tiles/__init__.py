@@ -21,7 +21,12 @@ from jscomb.numerics.tiles._neighbourhoods import (
     tile_side,
 )
 from jscomb.numerics.tiles._plans import network_plan
-from jscomb.numerics.tiles._programs import by_device, compiled, in_one_pass
+from jscomb.numerics.tiles._programs import (
+    by_device,
+    compiled,
+    in_memory,
+    in_one_pass,
+)
 
 __all__ = [
     "Crop",
@@ -35,6 +40,7 @@ __all__ = [
     "crops",
     "flat",
     "fold_rows",
+    "in_memory",
     "in_one_pass",
     "map_crops",
     "map_rows",

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 
 def compiled(function: Callable[..., Any], **static: Hashable) -> Callable[..., Any]:
@@ -84,3 +85,23 @@ def in_one_pass(function: Callable[..., Any], *arguments: Any) -> Any:
     # across it. It removes `lax.optimization_barrier` on CPUs.
     at_most_one = jnp.sum(first[:1] == 0)
     return lax.cond(at_most_one < 2, function, never, *arguments)
+
+
+def in_memory(*arrays: Array) -> tuple[Array, ...]:
+    """Return arrays as they are, computed once for all loops that read them.
+
+    Pads and sums over windows read at their borders, which makes their loops slow for
+    arithmetic.
+
+    Args:
+        arrays: of any shapes.
+
+    Returns:
+        the arrays.
+
+    Example:
+        >>> (x,) = in_memory(jnp.ones(1))
+        >>> print(x)
+        [1.]
+    """
+    return in_one_pass(lambda *same: same, *arrays)
