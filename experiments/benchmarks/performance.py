@@ -4,8 +4,8 @@ On the bundled frame, mirrored until it is as large as asked: seconds, the time 
 function's arithmetic takes at the rates of the same run (matrix products, other
 arithmetic, exponentials; or a copy of its arguments and results if that is longer), the
 ratio of the two, the most memory that its program needs beside its arguments, the power
-of the number of pixels that time grows by, and seconds of compilation. What has been
-measured is kept, and a second run goes on from there.
+of the number of pixels that time grows by, and seconds of compilation, also of the
+gradient. What has been measured is kept, and a second run goes on from there.
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from tqdm import tqdm
 
 from experiments.benchmarks.work import Work, rates, work_of
@@ -55,12 +56,14 @@ class Cost(NamedTuple):
         ceiling: seconds at the rates of the run.
         memory: bytes that the program needs beside arguments and results.
         compiling: seconds, tracing included.
+        compiling_gradient: likewise, of the results' sum; None where there is none.
     """
 
     seconds: float
     ceiling: float
     memory: int
     compiling: float
+    compiling_gradient: float | None
 
 
 def functions(*, quick: bool = False) -> dict[str, Callable[[Rendering], Any]]:
@@ -79,7 +82,11 @@ def functions(*, quick: bool = False) -> dict[str, Callable[[Rendering], Any]]:
 
 
 def measure(
-    function: Callable[[Rendering], Any], r: Rendering, best: Callable[[], Work]
+    function: Callable[[Rendering], Any],
+    r: Rendering,
+    best: Callable[[], Work],
+    *,
+    backwards: bool,
 ) -> Cost:
     """One function at one size.
 
@@ -87,13 +94,12 @@ def measure(
         function: to compile and call.
         r: what it is given.
         best: the machine's rates, measured when they are first needed.
+        backwards: whether it has a gradient to compile.
 
     Returns:
         its cost; the median of some calls after the first, or that if it is long.
     """
-    start = time.perf_counter()
-    program = jax.jit(function).lower(r).compile()
-    compiling = time.perf_counter() - start
+    program, compiling = _compiled(function, r)
     start = time.perf_counter()
     jax.block_until_ready(program(r))
     seconds = time.perf_counter() - start
@@ -102,7 +108,22 @@ def measure(
         seconds = medians({"": lambda: program(r)}, repeats)[""]
     memory = program.memory_analysis().temp_size_in_bytes
     ceiling = work_of(function, r).seconds(best())
-    return Cost(seconds, ceiling, memory, compiling)
+    compiling_gradient = None
+    if backwards:
+        compiling_gradient = _compiled(jax.grad(_total(function)), r)[1]
+    return Cost(seconds, ceiling, memory, compiling, compiling_gradient)
+
+
+def _compiled(function: Callable[[Rendering], Any], r: Rendering) -> tuple[Any, float]:
+    """A function's program, and seconds of tracing and compiling it."""
+    start = time.perf_counter()
+    program = jax.jit(function).lower(r).compile()
+    return program, time.perf_counter() - start
+
+
+def _total(function: Callable[[Rendering], Any]) -> Callable[[Rendering], jax.Array]:
+    """The sum of all that a function returns, to differentiate."""
+    return lambda r: sum(map(jnp.sum, jax.tree.leaves(function(r))))
 
 
 def run(config: Config) -> dict[str, dict[int, Cost]]:
@@ -116,6 +137,7 @@ def run(config: Config) -> dict[str, dict[int, Cost]]:
     """
     sizes = (32, 64) if config.quick else config.sizes
     found = functions(quick=config.quick)
+    forwards = {n for n, each in catalogue.solvers().items() if not each.backwards}
     kept, costs = Results(config.results), {}
     wanted = [name for name in found if name.startswith(config.only)]
     best = functools.cache(lambda: rates(repeats=3))
@@ -125,7 +147,8 @@ def run(config: Config) -> dict[str, dict[int, Cost]]:
     for size in sizes:
         r = mirrored(small, size)
         for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
-            make = functools.partial(measure, found[name], r, best)
+            backwards = name not in forwards
+            make = functools.partial(measure, found[name], r, best, backwards=backwards)
             cost = kept.get(f"{name}, {size}", make)
             costs.setdefault(name, {})[size] = Cost(*cost)
     return costs
@@ -143,6 +166,7 @@ class Row(NamedTuple):
         memory_large: bytes a pixel at the larger.
         growth: the power of the pixels that the time grows as.
         compiling: seconds.
+        compiling_gradient: likewise.
     """
 
     name: str
@@ -153,6 +177,7 @@ class Row(NamedTuple):
     memory_large: float
     growth: float
     compiling: float
+    compiling_gradient: float | None
 
 
 def row(name: str, costs: dict[int, Cost]) -> Row:
@@ -176,6 +201,7 @@ def row(name: str, costs: dict[int, Cost]) -> Row:
         last.memory / pixels,
         math.log(last.seconds / first.seconds) / math.log(pixels / small**2),
         first.compiling,
+        first.compiling_gradient,
     )
 
 
@@ -200,7 +226,8 @@ def report(costs: dict[str, dict[int, Cost]]) -> Report:
     )
     sizes = list(next(iter(costs.values())))
     memory = [f"B/pixel at {size}" for size in sizes]
-    header = "function", "s/Mpx", "ceiling", "ratio", *memory, "growth", "compiling, s"
+    header = "function", "s/Mpx", "ceiling", "ratio", *memory, "growth"
+    header = *header, "compiling, s", "gradient compiling, s"
     return Report(answer, table(header, rows))
 
 
