@@ -403,3 +403,21 @@ def test_frame_without_what_it_needs(rng):
         means(jnp.ones((4, 4, 3)), jnp.ones((5, 4, 3)), jnp.ones((5, 4, 3)))
     with pytest.raises(ValueError, match="window must be odd"):
         means(*map(jnp.asarray, noisy(rng)), window=4)
+
+
+@pytest.mark.parametrize("window", [9, 11])
+def test_derivatives_through_windows_of_several_pieces(window):
+    """Where the columns of a row do and do not fill its pieces."""
+    x = jnp.asarray(np.random.default_rng(4).normal(1, 0.5, (2, 13, 12, 1)))
+    variance = jnp.full_like(x[0], 0.3)
+
+    @jax.jit
+    def denoised(image, guide, strength):
+        return nonlocal_means.denoise(
+            image, guide, variance, window=window, patch=3, strength=strength
+        )
+
+    given = (*x, jnp.asarray(1.0))
+    check_grads(denoised, given, 1, modes=("fwd", "rev"), rtol=1e-5)
+    _, tangent = jax.jvp(denoised, given, (*jnp.ones_like(x), jnp.asarray(0.0)))
+    assert np.abs(np.asarray(tangent) - 1).max() < 1e-9  # a shift of both images

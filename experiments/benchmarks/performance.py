@@ -5,10 +5,10 @@ function's arithmetic takes at the rates of the same run (matrix products, other
 arithmetic, exponentials; or a copy of its arguments and results if that is longer), the
 ratio of the two, the most memory that its program needs beside its arguments, the power
 of the number of pixels that time grows by, and seconds of compilation, also of the
-gradient. With an earlier package each function's seconds before are measured beside it,
-in a process of their own. The plot shows arithmetic a second over arithmetic a byte,
-below the machine's rates. What has been measured is kept, and a second run goes on from
-there.
+gradient at the smaller size. With an earlier package each function's seconds before are
+measured beside it, in a process of their own. The plot shows arithmetic a second over
+arithmetic a byte, below the machine's rates. What has been measured is kept, and a
+second run goes on from there.
 """
 
 import concurrent.futures
@@ -128,7 +128,7 @@ def measure(
         function: to compile and call.
         r: what it is given.
         best: the machine's rates.
-        backwards: whether it has a gradient to compile.
+        backwards: compile its gradient too.
 
     Returns:
         its cost.
@@ -240,7 +240,8 @@ def run(config: Config) -> Found:
         for size in sizes:
             r = rendering(size, quick=config.quick)
             for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
-                of = functools.partial(measure, backwards=name not in forwards)
+                backwards = name not in forwards and size == sizes[0]
+                of = functools.partial(measure, backwards=backwards)
                 make = functools.partial(of, found[name], r, best)
                 cost = kept.get(f"{name}, {size}", make)
                 costs.setdefault(name, {})[size] = Cost(*cost)

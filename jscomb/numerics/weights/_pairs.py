@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from jscomb.numerics.guards import (
@@ -24,6 +26,9 @@ from jscomb.numerics.tiles import (
 from jscomb.numerics.windows import check_window
 
 Pairs = Float[Array, "_ _ _ ..."]  # planes of one pixel of each pair
+
+
+_COLUMNS = 8  # of a window at a time, at most, for derivatives
 
 
 class Weights(NamedTuple):
@@ -72,27 +77,77 @@ def weighted_mean(
     tile = tile_side(*image.shape[:2])
     grid = Grid(tile, 1, reach, 2)
     wide = tile + 2 * halo
+    # Traced once rather than once a column; what it encloses becomes its argument.
+    like = jax.ShapeDtypeStruct((guide.shape[-1], wide, wide), guide.dtype)
+    pair, enclosed = jax.closure_convert(weights.pair, like, like)
+    pair = jax.jit(pair)
 
     def region(planes: Float[Array, "h w _"], reach: int) -> Region:
         return Region(jnp.moveaxis(planes, -1, 0), reach)
 
-    def sum_windows(near: Planes, seen: Planes) -> Planes:
-        """Sum over the windows of a tile: the image and the weights."""
+    def start(near: Planes, seen: Planes) -> tuple[Planes, Planes]:
+        """The centres, and sums to begin with."""
         centre = seen[:, reach : reach + wide, reach : reach + wide]
+        return centre, jnp.zeros((len(near), tile, tile), near.dtype)
+
+    @jax.custom_jvp
+    def sum_windows(near: Planes, seen: Planes, *enclosed: Array) -> Planes:
+        """Sum over the windows of a tile: the image and the weights."""
+        centre, zero = start(near, seen)
 
         def add_row(total: Planes, moved: list[Planes]) -> Planes:
             near, seen = moved
             for dx in range(window):
-                w = weights.pair(centre, seen[:, :wide, dx : dx + wide])
+                w = pair(centre, seen[:, :wide, dx : dx + wide], *enclosed)
                 total = total + w[None] * near[:, :tile, dx : dx + tile]
             return total
 
-        start = jnp.zeros((len(near), tile, tile), near.dtype)
-        return fold_rows(add_row, start, [near, seen], window)
+        return fold_rows(add_row, zero, [near, seen], window)
+
+    pieces = -(-window // _COLUMNS)  # of a row
+    columns = -(-window // pieces)
+
+    def sum_pieces(near: Planes, seen: Planes, *enclosed: Array) -> Planes:
+        """The same by few columns at a time, for derivatives.
+
+        Those of a whole row take the compiler minutes, and are slower.
+        """
+        centre, zero = start(near, seen)
+
+        def piece(k: Array) -> tuple[Planes, Planes, Array]:
+            """Planes from the k-th piece's first column on, and which columns count."""
+            row, first = k // pieces, k % pieces * columns
+            at = jnp.minimum(first, window - columns)
+            cut = lambda planes, size: lax.dynamic_slice(
+                planes, (0 * row, row, at), (len(planes), size, size + columns - 1)
+            )
+            counts = at + jnp.arange(columns) >= first
+            return cut(near, tile), cut(seen, wide), counts
+
+        @jax.checkpoint
+        def add_piece(carry: tuple, k: Array) -> tuple:
+            total, (near, seen, counts) = carry
+            for dx in range(columns):
+                w = pair(centre, seen[:, :, dx : dx + wide], *enclosed)
+                w = jnp.where(counts[dx], w, 0.0)
+                total = total + w[None] * near[:, :, dx : dx + tile]
+            return (total, piece(k + 1)), None
+
+        numbers = jnp.arange(window * pieces)
+        # A step's planes are cut in the step before, or each use would cut them again.
+        return lax.scan(add_piece, (zero, piece(numbers[0])), numbers)[0][0]
+
+    sum_windows.defjvp(lambda *given: jax.jvp(sum_pieces, *given))
 
     counted = jnp.concatenate([clean, valid.astype(image.dtype)], axis=-1)
     regions = [region(counted, reach), region(guide, reach + halo)]
-    sums = jnp.moveaxis(sum_over_tiles(sum_windows, regions, grid, reach=0), 0, -1)
+    sums = jnp.moveaxis(
+        sum_over_tiles(
+            lambda *near: sum_windows(*near, *enclosed), regions, grid, reach=0
+        ),
+        0,
+        -1,
+    )
     mean = weighted_ratio(sums[..., :-1], sums[..., -1:])
     return jnp.where(valid, mean, first_finite(image))
 
@@ -124,7 +179,8 @@ def tile_weights(weights: Weights, planes: Planes, grid: Grid) -> Float[Array, "
     middle = slice(grid.reach, grid.reach + inner)
     centre = planes[:, middle, middle, None]
     moved = jnp.stack([planes[:, :, k : k + inner] for k in range(offsets)], axis=-1)
-    rows = [weights.pair(centre, moved[:, k : k + inner]) for k in range(offsets)]
+    pair = jax.jit(weights.pair)  # traced once
+    rows = [pair(centre, moved[:, k : k + inner]) for k in range(offsets)]
     w = _place(jnp.stack(rows))  # [offset row, row, column, near column]
     w = _place(jnp.transpose(w, (2, 3, 1, 0)))  # [column, near column, row, near row]
     w = jnp.transpose(w, (2, 0, 3, 1)).reshape(grid.step**2, -1)
