@@ -37,6 +37,7 @@ def test_demo_of_a_small_frame(jscomb, tmp_path, monkeypatch, glass_frame):
     exr.write_frame(small, jax.tree.map(corner, glass_frame))
     monkeypatch.setattr(exr, "bundled", lambda: {_demo.NAME: small})
     monkeypatch.setattr(_demo, "PAPERS", ("whitened",))
+    monkeypatch.setattr(_demo, "_APART", ("whitened",))
     monkeypatch.setattr(_demo, "TIERS", ("fast",))
     status, said, _ = jscomb("demo", "--out", out)
     assert status == 0
