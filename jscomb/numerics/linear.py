@@ -29,7 +29,8 @@ def with_transpose(
     Args:
         function: linear, from one array to another of its shape; may depend on no other
             array that has a derivative.
-        transpose: of the function, from its result's shape to that of the image.
+        transpose: of the function, from its result's shape to that of the image; may be
+            the function itself.
         image: any unit and shape.
 
     Returns:
@@ -48,6 +49,8 @@ def with_transpose(
     # solve, the identity, is not looked at.
     same = lambda image: image
     forward, backward = (lambda _, b, f=f: f(b) for f in (function, transpose))
+    if transpose is function:  # traced once
+        return lax.custom_linear_solve(same, image, forward, symmetric=True)
     return lax.custom_linear_solve(same, image, forward, backward)
 
 

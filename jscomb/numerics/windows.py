@@ -253,9 +253,11 @@ def separable_sum(
     image = _only(image, mask, 0.0)
     if isinstance(kernel, Tracer):  # it may have a derivative
         return _separable(image, kernel)
-    taps = jnp.asarray(np.asarray(kernel), image.dtype)
-    of = lambda taps: functools.partial(_separable, kernel=taps)
-    return with_transpose(of(taps), of(taps[::-1]), image)
+    taps = np.asarray(kernel)
+    of = lambda k: functools.partial(_separable, kernel=jnp.asarray(k, image.dtype))
+    total = of(taps)
+    even = np.array_equal(taps, taps[::-1])
+    return with_transpose(total, total if even else of(taps[::-1]), image)
 
 
 def window_count(
