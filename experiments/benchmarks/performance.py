@@ -91,7 +91,7 @@ class Found(NamedTuple):
     Attributes:
         costs: by function and size.
         before: seconds of the earlier package at the larger size, by function; None
-            where it has no such function.
+            where it has no such function, or it took other arguments.
         rates: of the machine.
     """
 
@@ -192,12 +192,12 @@ def seconds_here(name: str, size: int, quick: bool) -> float | None:
         quick: as of `rendering`.
 
     Returns:
-        seconds; None if the package has no such function.
+        seconds; None if the package has no such function, or it took other arguments.
     """
     r = rendering(size, quick=quick)
     try:
         program, _ = _compiled(functions()[name], r)
-    except AttributeError:
+    except (AttributeError, TypeError, ValueError):
         return None
     return _seconds(program, r)
 
