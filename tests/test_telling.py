@@ -98,6 +98,17 @@ def test_json_is_one_line_a_frame(combine, two, tmp_path):
     assert strictly(said.splitlines()[0])["status"] == "there already"
 
 
+def test_json_of_the_only_frame_that_fails(jscomb, tmp_path):
+    path, out = tmp_path / "s.exr", tmp_path / "o.exr"
+    path.write_bytes(b"no image")
+    status, said, error = jscomb("combine", path, "-o", out, "--json")
+    assert status == 2
+    found = strictly(said)
+    assert (found["frame"], found["out"]) == (str(path), str(out))
+    assert found["status"] == "failed"
+    assert error == f"jscomb: {path}: {found['error']}\n"
+
+
 def test_json_of_a_tier(jscomb, tmp_path, glass_frame):
     """Its estimates, why not others, its error, and those against the reference."""
     truth = glass_frame.reference.image

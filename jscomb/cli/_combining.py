@@ -136,7 +136,7 @@ def combine(
             check_folder(job.target)
     with Teller(speaking, len(jobs)) as teller:
         if len(jobs) == 1:
-            _combine_job(jobs[0], options, limits, teller)
+            _combine_alone(jobs[0], options, limits, teller)
         else:
             _combine_sequence(jobs, options, limits, teller)
 
@@ -205,6 +205,24 @@ def _matched(
     return match(option, given, frames)
 
 
+_FAILURES = ValueError, OSError, ImportError, RuntimeError
+
+
+def _why(job: Job, error: Exception) -> str:
+    """Why a frame failed, in one line that does not name the frame."""
+    return " ".join(str(error).split()).removeprefix(f"{job.frame}: ")
+
+
+def _combine_alone(job: Job, options: Options, limits: Limits, teller: Teller) -> None:
+    """Combine the only frame; a failure is raised, and told to programs."""
+    try:
+        _combine_job(job, options, limits, teller)
+    except _FAILURES as error:
+        found = {"frame": job.frame, "out": job.target, "status": "failed"}
+        teller.give(**found, error=_why(job, error))
+        raise
+
+
 def _combine_sequence(
     jobs: Sequence[Job], options: Options, limits: Limits, teller: Teller
 ) -> None:
@@ -215,9 +233,8 @@ def _combine_sequence(
         with teller.frame(name):
             try:
                 _combine_job(job, options, limits, teller)
-            except (ValueError, OSError, ImportError, RuntimeError) as error:
-                why = " ".join(str(error).split()).removeprefix(f"{job.frame}: ")
-                teller.fail(job.frame, job.target, why)
+            except _FAILURES as error:
+                teller.fail(job.frame, job.target, _why(job, error))
                 failed.append(name)
     if failed:
         raise ValueError(

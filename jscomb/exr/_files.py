@@ -24,6 +24,7 @@ from jscomb.exr._header import Patched, Raw, read_raw
 
 MAX_BYTES = 8 * 2**30  # default limit for the pixels that are read, in memory
 MAX_TILE_BYTES = 2**28  # limit of a tile, whatever `max_bytes` is
+_START = b"\x76\x2f\x31\x01"  # of every EXR file
 _DEEP = 8  # how much larger than its file a deep image is taken to be
 _FLAT = (OpenEXR.scanlineimage, OpenEXR.tiledimage)
 _UNFINISHED: set[str] = set()  # temporary files, for `discard_unfinished`
@@ -251,9 +252,13 @@ def _opened(path: str, source: Any, *, header_only: bool) -> OpenEXR.File:
 
 def _unreadable(path: str, error: Exception) -> ValueError:
     """The error for a file that the binding cannot read."""
+    with open(path, "rb") as file:
+        start = file.read(len(_START))
     reason = str(error).replace("<python_buffer>", path)
-    if os.path.getsize(path) == 0:
+    if not start:
         reason = "is empty"
+    elif start != _START:
+        reason = "has other content, by its first bytes"
     return ValueError(f"{path}: not a readable EXR file: {reason}")
 
 

@@ -6,15 +6,14 @@ its pixels varies, and any image of at least 1x1 works, also one smaller than th
 window. Layout: images [H,W,C] of any unit, which is that of the result. A `mask`
 [H,W,1] selects pixels, None all; the others are excluded, and may be NaN.
 
-Sums add the window's own pixels, separably where all windows have the same weights.
-Running differences (integral images) are never used: one firefly of 1e6 would erase the
-float32 digits of every later pixel in its row. Columns are summed by doubling (over 1,
-2, 4, ... pixels, combined by the bits of w), the fastest form on a CPU. Rows are summed
-by `lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
-(two collective permutes, where doubling needs twelve); for wide windows twice, which
-costs less. Extrema double along both axes: `reduce_window` is many times slower on a
-CPU. Gaussian weights have no such form, nor have those of `kernels`, which differ from
-pixel to pixel: sharded by rows they exchange pixels once for every row of the window.
+Sums add the window's own pixels, separably where all windows have the same weights, not
+by running differences (integral images): one firefly of 1e6 would erase the float32
+digits of every later pixel in its row. Columns are summed by doubling (1, 2, 4, ...
+pixels, combined by the bits of w), the fastest form on a CPU. Rows are summed by
+`lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
+(doubling needs twelve), for wide windows twice. Extrema double along both axes:
+`reduce_window` is many times slower on a CPU. Gaussian weights have no such form, nor
+have those of `kernels`: sharded by rows they exchange pixels for every row of a window.
 """
 
 import functools
