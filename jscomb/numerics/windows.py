@@ -10,10 +10,9 @@ Sums add the window's own pixels, separably where all windows have the same weig
 by running differences (integral images): one firefly of 1e6 would erase the float32
 digits of every later pixel in its row. Columns are summed by doubling (1, 2, 4, ...
 pixels, combined by the bits of w), the fastest form on a CPU. Rows are summed by
-`lax.reduce_window`, which an image sharded by rows turns into one exchange of halos
-(doubling needs twelve), for wide windows twice. Extrema double along both axes:
-`reduce_window` is many times slower on a CPU. Gaussian weights have no such form, nor
-have those of `kernels`: sharded by rows they exchange pixels for every row of a window.
+`lax.reduce_window`, where an image sharded by rows exchanges halos once, not twelve
+times; for wide windows twice. Extrema double along both axes: there it is many times
+slower on a CPU. Gaussian weights and those of `kernels` have no such form.
 """
 
 import functools
@@ -254,9 +253,9 @@ def separable_sum(
         return _separable(image, kernel)
     taps = np.asarray(kernel)
     of = lambda k: functools.partial(_separable, kernel=jnp.asarray(k, image.dtype))
-    total = of(taps)
-    even = np.array_equal(taps, taps[::-1])
-    return with_transpose(total, total if even else of(taps[::-1]), image)
+    total, turned = of(taps), of(taps[::-1])
+    even = (taps == taps[::-1]).all()
+    return with_transpose(total, total if even else turned, image)
 
 
 def window_count(
