@@ -5,9 +5,9 @@ function's arithmetic takes at the rates of the same run (matrix products, other
 arithmetic, exponentials; or a copy of its arguments and results if that is longer), the
 ratio of the two, the most memory that its program needs beside its arguments, the power
 of the number of pixels that time grows by, and seconds of compilation, also of the
-gradient at the smaller size. With an earlier package each function's seconds before are
-measured beside it, in a process of their own. The plot shows arithmetic a second over
-arithmetic a byte, below the machine's rates. What has been measured is kept, and a
+gradient at the smaller size. With an earlier package each function's seconds by it and
+by this one are measured in turns, in a process each. The plot shows arithmetic a second
+over arithmetic a byte, below the machine's rates. What has been measured is kept, and a
 second run goes on from there.
 """
 
@@ -31,6 +31,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+import jscomb
 from experiments.benchmarks.work import Work, rates, work_of
 from experiments.common.command import Options, main
 from experiments.common.report import Report
@@ -90,13 +91,13 @@ class Found(NamedTuple):
 
     Attributes:
         costs: by function and size.
-        before: seconds of the earlier package at the larger size, by function; None
-            where it has no such function, or it took other arguments.
+        before: seconds of the earlier package and of this one at the larger size, by
+            function; None where it has no such function, or it took other arguments.
         rates: of the machine.
     """
 
     costs: dict[str, dict[int, Cost]]
-    before: dict[str, float | None]
+    before: dict[str, tuple[float | None, float]]
     rates: Work
 
 
@@ -235,20 +236,25 @@ def run(config: Config) -> Found:
     kept, costs, before = Results(config.results), {}, {}
     wanted = [name for name in found if name.startswith(config.only)]
     best = Work(*kept.get("rates", lambda: rates(repeats=3)))
-    with contextlib.ExitStack() as stack:
-        earlier = config.before and stack.enter_context(process_of(config.before))
-        for size in sizes:
-            r = rendering(size, quick=config.quick)
-            for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
-                backwards = name not in forwards and size == sizes[0]
-                of = functools.partial(measure, backwards=backwards)
-                make = functools.partial(of, found[name], r, best)
-                cost = kept.get(f"{name}, {size}", make)
-                costs.setdefault(name, {})[size] = Cost(*cost)
-                if earlier and size == sizes[-1]:
-                    given = seconds_here, name, size, config.quick
-                    make = lambda given=given: earlier.submit(*given).result()
-                    before[name] = kept.get(f"{name}, {size}, before", make)
+    for size in sizes:
+        r = rendering(size, quick=config.quick)
+        for name in tqdm(wanted, unit="function", desc=f"{size}x{size}"):
+            backwards = name not in forwards and size == sizes[0]
+            of = functools.partial(measure, backwards=backwards)
+            make = functools.partial(of, found[name], r, best)
+            cost = kept.get(f"{name}, {size}", make)
+            costs.setdefault(name, {})[size] = Cost(*cost)
+    if config.before:
+        here = pathlib.Path(jscomb.__file__).parents[1]
+        with process_of(config.before) as earlier, process_of(here) as present:
+
+            def in_turns(*given: Any) -> list[float | None]:
+                processes = earlier, present
+                return [p.submit(seconds_here, *given).result() for p in processes]
+
+            for name in tqdm(wanted, unit="function", desc="before"):
+                make = functools.partial(in_turns, name, sizes[-1], config.quick)
+                before[name] = kept.get(f"{name}, {sizes[-1]}, in turns", make)
     return Found(costs, before, best)
 
 
@@ -257,7 +263,7 @@ class Row(NamedTuple):
 
     Attributes:
         name: of the function.
-        before: seconds a megapixel by the earlier package, if any.
+        change: seconds by this package over those by the earlier one, if any.
         seconds: a megapixel.
         ceiling: seconds of its arithmetic or of a copy, a megapixel.
         ratio: of both.
@@ -269,7 +275,7 @@ class Row(NamedTuple):
     """
 
     name: str
-    before: float | None
+    change: float | None
     seconds: float
     ceiling: float
     ratio: float
@@ -280,13 +286,13 @@ class Row(NamedTuple):
     compiling_gradient: float | None
 
 
-def row(name: str, costs: dict[int, Cost], before: float | None) -> Row:
+def row(name: str, costs: dict[int, Cost], change: float | None) -> Row:
     """One line of the table.
 
     Args:
         name: of the function.
         costs: at two sizes, the smaller first.
-        before: seconds of the earlier package, if any.
+        change: seconds by this package over those by the earlier one, if any.
 
     Returns:
         its cells.
@@ -295,7 +301,7 @@ def row(name: str, costs: dict[int, Cost], before: float | None) -> Row:
     pixels = large**2
     return Row(
         f"`{name}`",
-        before and 1e6 * before / pixels,
+        change,
         1e6 * last.seconds / pixels,
         1e6 * last.ceiling / pixels,
         last.seconds / last.ceiling,
@@ -351,7 +357,8 @@ def report(found: Found) -> Report:
         a line a function, and the plot.
     """
     costs, before, _ = found
-    rows = [row(name, cost, before.get(name)) for name, cost in costs.items()]
+    changes = {name: now / then for name, (then, now) in before.items() if then}
+    rows = [row(name, cost, changes.get(name)) for name, cost in costs.items()]
     ratios = sorted(each.ratio for each in rows)
     growth = [each.growth for each in rows]
     slowest = max(rows, key=lambda each: each.ratio)
@@ -361,17 +368,24 @@ def report(found: Found) -> Report:
         f"{ratios[-1]:.0f} times ({slowest.name}); time grows as the pixels to a power "
         f"of {min(growth):.2f} to {max(growth):.2f}."
     )
-    gains = [each.before / each.seconds for each in rows if each.before]
-    if gains:
-        faster = sum(gain > NOISE for gain in gains)
-        slower = sum(gain < 1 / NOISE for gain in gains)
+    if changes:
+        faster = sum(change < 1 / NOISE for change in changes.values())
+        slower = sum(change > NOISE for change in changes.values())
         answer += (
-            f" Of {len(gains)} that were there before {faster} take less than "
+            f" Of {len(changes)} that were there before {faster} take less than "
             f"{1 / NOISE:.2f} of the time, {slower} more than {NOISE:.2f} times."
         )
     sizes = list(next(iter(costs.values())))
     memory = [f"B/pixel at {size}" for size in sizes]
-    header = "function", "before, s/Mpx", "s/Mpx", "ceiling", "ratio", *memory, "growth"
+    header = (
+        "function",
+        "of the time before",
+        "s/Mpx",
+        "ceiling",
+        "ratio",
+        *memory,
+        "growth",
+    )
     header = *header, "compiling, s", "gradient compiling, s"
     body = table(header, rows)
     return Report(answer, body, {"arithmetic a second": roofline(found)})

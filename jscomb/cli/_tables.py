@@ -7,7 +7,8 @@ from jscomb import metrics
 from jscomb.exr import Contents
 from jscomb.frame import Frame
 from jscomb.numerics.guards import finite
-from jscomb.typing import Image
+from jscomb.numerics.tiles import compiled
+from jscomb.typing import Image, Mask, Scalar
 
 
 def errors(images: Mapping[str, Image], frame: Frame) -> tuple[dict[str, float], str]:
@@ -16,13 +17,19 @@ def errors(images: Mapping[str, Image], frame: Frame) -> tuple[dict[str, float],
     And a line on the pixels that are not finite; empty if all are.
     """
     assert frame.reference is not None
-    r, noise = frame.reference
-    mask = finite(r, *images.values())
+    found, mask = compiled(_errors)(dict(images), *frame.reference)
     excluded = int((~mask).sum())
     line = f"{excluded} of {mask.size} pixels are not finite and were excluded"
+    return {n: float(e) for n, e in found.items()}, line if excluded else ""
+
+
+def _errors(
+    images: dict[str, Image], r: Image, noise: Image | None
+) -> tuple[dict[str, Scalar], Mask]:
+    """Relative L2 by name, and which pixels all images have."""
+    mask = finite(r, *images.values())
     error = functools.partial(metrics.rel_l2, half_difference=noise, mask=mask)
-    found = {name: float(error(image, r)) for name, image in images.items()}
-    return found, line if excluded else ""
+    return {name: error(image, r) for name, image in images.items()}, mask
 
 
 def rounded(errors: Mapping[str, float]) -> dict[str, str]:

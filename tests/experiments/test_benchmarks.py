@@ -99,8 +99,11 @@ def test_performance_of_an_earlier_package(tmp_path):
         given = performance.seconds_here, "smoothing.box", 32, True
         seconds = process.submit(*given).result()
     costs = {"smoothing.box": dict.fromkeys((16, 32), performance.Cost(*[1.0] * 7))}
-    found = performance.Found(costs, {"smoothing.box": seconds}, Work(*[1.0] * 4))
-    assert "Of 1 that were there before" in performance.report(found).answer
+    before = {"smoothing.box": (seconds, 2 * seconds)}
+    found = performance.Found(costs, before, Work(*[1.0] * 4))
+    said = performance.report(found)
+    assert "Of 1 that were there before 0 take less than 0.80" in said.answer
+    assert "| `smoothing.box` | 2.00 |" in said.body
 
 
 @pytest.mark.slow
