@@ -102,7 +102,7 @@ def test_performance_of_an_earlier_package(tmp_path):
     before = {"smoothing.box": (seconds, 2 * seconds)}
     found = performance.Found(costs, before, Work(*[1.0] * 4))
     said = performance.report(found)
-    assert "Of 1 that were there before 0 take less than 0.80" in said.answer
+    assert "Of 1 that were there before 0 take less than 0.50" in said.answer
     assert "| `smoothing.box` | 2.00 |" in said.body
 
 
