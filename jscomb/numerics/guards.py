@@ -179,13 +179,14 @@ def finite(*images: Float[Array, "h w _"]) -> Mask:
         >>> print(finite(jnp.array([[[1.0, jnp.nan], [1.0, 2.0]]]))[..., 0])
         [[False  True]]
     """
-    by_channels: dict[int, list[Array]] = {}
-    for image in images:
-        by_channels.setdefault(image.shape[-1], []).append(jnp.isfinite(image))
-    # One reduction for all images of as many channels, in one loop.
-    masks = (functools.reduce(operator.and_, each) for each in by_channels.values())
-    each = (jnp.all(mask, axis=-1, keepdims=True) for mask in masks)
-    return functools.reduce(operator.and_, each)
+    # Slices, unlike a reduction, are part of the loop that reads the mask.
+    everywhere = jnp.ones((*images[0].shape[:-1], 1), bool)
+    each = (
+        jnp.isfinite(image[..., k : k + 1])
+        for image in images
+        for k in range(image.shape[-1])
+    )
+    return functools.reduce(operator.and_, each, everywhere)
 
 
 def zero_invalid(*images: Float[Array, "..."]) -> tuple[Mask, *tuple[Array, ...]]:
