@@ -11,8 +11,8 @@ by running differences (integral images): one firefly of 1e6 would erase the flo
 digits of every later pixel in its row. Columns are summed by doubling (1, 2, 4, ...
 pixels, combined by the bits of w), the fastest form on a CPU. Rows are summed by
 `lax.reduce_window`, where an image sharded by rows exchanges halos once, not twelve
-times; for wide windows twice. Extrema double along both axes: there it is many times
-slower on a CPU. Gaussian weights and those of `kernels` have no such form.
+times; for wide windows twice. Extrema double along both axes: `reduce_window` of them
+is many times slower on a CPU. Gaussian weights and those of `kernels` double in no way.
 """
 
 import functools
