@@ -20,7 +20,8 @@ def errors(images: Mapping[str, Image], frame: Frame) -> tuple[dict[str, float],
     found, mask = compiled(_errors)(dict(images), *frame.reference)
     excluded = int((~mask).sum())
     line = f"{excluded} of {mask.size} pixels are not finite and were excluded"
-    return {n: float(e) for n, e in found.items()}, line if excluded else ""
+    # A program's dictionary comes back sorted; a table keeps the images' order.
+    return {n: float(found[n]) for n in images}, line if excluded else ""
 
 
 def _errors(
