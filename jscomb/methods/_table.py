@@ -81,9 +81,9 @@ def _oidn(summary: str, name: str) -> Method:
     return Method(summary, variant.needs, "nothing", make=make, variant=variant)
 
 
-def _filter(summary: str, room: Any) -> Method:
+def _filter(summary: str, room: Any, **options: Any) -> Method:
     """A method that denoises a frame by a local function."""
-    plan = lambda key, frame: room.plan_frame(frame)
+    plan = lambda key, frame: room.plan_frame(frame, **options)
     return Method(summary, room.NEEDS, "nothing", plan, pure=True)
 
 
@@ -116,7 +116,7 @@ FEW = (
     *("oidn", "path-tracing", "oidn-demodulated", "nonlocal-means"),
     *("whitened", "multi-scale"),
 )
-"""What `neural-ensemble` and the tier `balanced` are made of."""
+"""What `neural-ensemble` is made of."""
 
 METHODS: dict[str, Method] = {
     **{
@@ -141,6 +141,9 @@ METHODS: dict[str, Method] = {
     ),
     "bilateral": _filter("joint bilateral filter", bilateral),
     "nonlocal-means": _filter("non-local means", nonlocal_means),
+    "nonlocal-means-narrow": _filter(
+        "non-local means that search 11x11 pixels", nonlocal_means, window=11
+    ),
     "rdfc": _filter("non-local means restricted by the features", rdfc),
     "gaussian": _filter("Gaussian blur", smoothing),
     "path-tracing": Method(
