@@ -4,6 +4,8 @@ Errors of the input are one line on standard error and exit status 2; Ctrl-C is 
 and status 130, also while the package is still being imported.
 """
 
+import atexit
+import gc
 import importlib
 import io
 import os
@@ -45,6 +47,7 @@ def main() -> None:
     try:
         with ends_on_interrupt():
             _use_compilation_cache()
+            collect_rarely()
             parsing = importlib.import_module("jscomb.cli._parsing")
             parsing.parse()()
             sys.stdout.flush()
@@ -61,6 +64,15 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     room = "_rendering" if name == "render_file" else "_training"
     return getattr(importlib.import_module(f"{__name__}.{room}"), name)
+
+
+def collect_rarely() -> None:
+    """Look rarely for garbage in cycles, and never at the end.
+
+    Tracing makes millions of objects, hardly one of them in a cycle.
+    """
+    gc.set_threshold(100_000, 20, 50)
+    atexit.register(gc.freeze)
 
 
 def _use_compilation_cache() -> None:

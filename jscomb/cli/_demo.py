@@ -1,6 +1,7 @@
 """`jscomb demo`: every kind of method on one frame, its error beside its time."""
 
 import contextlib
+import importlib
 import multiprocessing
 import os
 import signal
@@ -17,6 +18,7 @@ import numpy as np
 
 from jscomb import exr, methods
 from jscomb.cli import _tables as tables
+from jscomb.cli import collect_rarely
 from jscomb.denoisers import oidn
 from jscomb.frame import Frame
 from jscomb.typing import Image
@@ -49,12 +51,18 @@ def demo(*, out: Path = _OUT) -> None:
     here = *TIERS, *denoiser, *(name for name in PAPERS if name not in _APART)
     with _other_process(file, _APART) as other:
         made = _made(frame, here)
-        from jscomb import plots  # matplotlib is slow to import
-
+        importlib.import_module("jscomb.plots")  # matplotlib is slow to import
         made |= _received(other)
         ms = _ms(frame, here)
         other.send("time them")  # nothing else runs now
         ms |= _received(other)
+        _tell(out, frame, made, ms)  # while the other process ends
+
+
+def _tell(out: Path, frame: Frame, made: Made, ms: dict[str, str]) -> None:
+    """Print the table, and write the images and their picture."""
+    from jscomb import plots
+
     made["denoised"], ms["denoised"] = frame.estimates["oidn"].image, ms.pop("oidn", "")
     images = {"path tracing": frame.color} | {
         name: image
@@ -76,7 +84,8 @@ def demo(*, out: Path = _OUT) -> None:
     shown = {name: images[name] for name in ("path tracing", "denoised", TIERS[-1])}
     plots.comparison(out / "comparison.png", frame, shown)
     print(f"wrote {out / 'comparison.png'} and the images as EXR")
-    print(f"look at them: jscomb view {file} {out / f'{NAME}-{TIERS[-1]}.exr'}")
+    best = out / f"{NAME}-{TIERS[-1]}.exr"
+    print(f"look at them: jscomb view {exr.bundled()[NAME]} {best}")
 
 
 @contextlib.contextmanager
@@ -100,6 +109,7 @@ def _other_process(file: Path, names: Sequence[str]) -> Iterator[Connection]:
 
 def _serve(ours: Connection, file: Path, names: Sequence[str]) -> None:
     """What the other process does."""
+    collect_rarely()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # the first process says that it ends
     threading.Thread(target=_end_with_the_first, daemon=True).start()
     frame = exr.read_frame(file)
