@@ -16,11 +16,11 @@ from jscomb import (
     metrics,
     uncorrelated,
 )
-from jscomb.denoisers import oidn
+from jscomb.denoisers import nonlocal_means, oidn
 from jscomb.frame import Estimate, Needs, make_frame
 from jscomb.learning import recipes
 from jscomb.methods import BASES, METHODS, TIERS, Method, combine_tier
-from jscomb.numerics.tiles import Local
+from jscomb.numerics.tiles import Local, compiled, cut, padded
 from tests.battery import catalogue
 from tests.conftest import DATA
 
@@ -41,16 +41,10 @@ def error(image, frame):
     return float(metrics.rel_l2(image, r, half_difference=noise))
 
 
-def cut(frame, size):
-    """A corner of a frame."""
-    corner = lambda i: i[..., :size, :size, :] if i.ndim > 2 else i
-    return jax.tree.map(corner, frame)
-
-
 @pytest.fixture(scope="module")
 def small(glass_frame):
     """A corner of a rendered frame, of one size, so that tests share programs."""
-    return cut(glass_frame, 24)
+    return cut(glass_frame, 24, 24)
 
 
 # Of any frame: what takes a second rendering has a test of its own.
@@ -77,6 +71,32 @@ def test_every_method_makes_an_estimate(name, small):
             alone = alone.with_estimate("oidn", fresh)
         expected = combine(key(), alone, method=name).image * unit
         np.testing.assert_allclose(own, expected, rtol=2e-4, atol=1e-5 * unit)
+
+
+@pytest.mark.parametrize("name", [n for n, m in METHODS.items() if m.pure])
+def test_invalid_pixels_beside_a_frame_change_nothing(name, glass_frame):
+    frame = cut(glass_frame, 19, 22).normalised()
+    takes = METHODS[name].takes == "one estimate"
+    given = (frame.estimates["oidn"],) if takes else ()
+    made = METHODS[name].estimate(key(), frame, *given)
+    wide = METHODS[name].estimate(key(), *padded((frame, *given), multiple=32))
+    for one, other in zip(made, cut(wide, 19, 22), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_sizes_near_each_other_share_programs(glass_frame):
+    """And the estimates are of their own size, as the methods make them alone."""
+    name = "nonlocal-means-narrow"
+    frames = [cut(glass_frame, *size).normalised() for size in ((21, 18), (17, 23))]
+    made = methods.with_inputs(key(), frames[0], [name])
+    program = compiled(nonlocal_means.denoise, window=11)
+    count = program._cache_size()
+    other = methods.with_inputs(key(), frames[1], [name])
+    assert program._cache_size() == count > 0
+    assert other.estimates[name].halves.shape == (2, 17, 23, 3)
+    alone = METHODS[name].estimate(key(), frames[0])
+    for one, other in zip(made.estimates[name], alone, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
 @needs_oidn

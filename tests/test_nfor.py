@@ -34,9 +34,11 @@ def means_by_loops(image, u, v, f=None, *, window, patch, strength):
 
     def slope(p, axis):
         step = np.eye(2, dtype=int)[axis]
-        p, q = (tuple(np.clip(p + s, 0, size - 1)) for s in (step, -step))
-        known = np.isfinite([f[p], f[q]]).all()
-        return ((f[p] - f[q]) / 2) ** 2 if known else 0 * f[0, 0]
+        around = (tuple(np.clip(p + s, 0, size - 1)) for s in (step, -step))
+        after, before = (
+            f[q] if np.isfinite(f[q]).all() else f[tuple(p)] for q in around
+        )
+        return ((after - before) / 2) ** 2
 
     def unlike(p, q):
         scale = 0.36 * np.maximum(slope(p, 0) + slope(p, 1), 1e-3)

@@ -200,9 +200,8 @@ def error_matrix(
 
 def _agreement(a: Packed, b: Packed, scale: int | None, count: Count) -> Count:
     """The share of both halves' difference that is not noise, in [0, 1], [H,W,1]."""
-    spread = jnp.mean(jnp.square(a) + jnp.square(b), axis=(0, 1), keepdims=True)
     # Each element relative to its spread, or those of a bad base would dominate.
-    spread = jnp.broadcast_to(safe_sqrt(spread), a.shape)
+    spread = safe_sqrt(pooled(jnp.square(a) + jnp.square(b), count, None))
     a, b = (divide(i, spread, where=spread > 0) for i in (a, b))
     both = jnp.sum(a * b, axis=-1, keepdims=True)
     square = jnp.sum(jnp.square((a + b) / 2), axis=-1, keepdims=True)

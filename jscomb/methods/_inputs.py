@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame, Maker
 from jscomb.methods._table import METHODS
+from jscomb.numerics.tiles import cut, padded
 from jscomb.typing import Key
 
 _DENOISER = "oidn"  # for frames without an estimate
@@ -212,11 +213,32 @@ def with_inputs(
         estimates = oidn.denoise_variants(frame, list(variants.values()))
         for name, estimate in zip(variants, estimates, strict=True):
             frame = frame.with_estimate(name, estimate)
+    local = []
     for name in names:
-        if name not in frame.estimates:
-            tell(progress, f"making {name}", frame)
+        if name in frame.estimates:
+            continue
+        if _sees_only_pixels(name, frame):
+            local.append(name)
+            continue
+        tell(progress, f"making {name}", frame)
         frame = with_input(key, frame, name)
+    wide = padded(frame) if local else frame
+    for name in local:
+        tell(progress, f"making {name}", wide)
+        wide = with_input(key, wide, name)
+        estimate = cut(wide.estimates[name], *frame.color.shape[:2])
+        frame = frame.with_estimate(name, estimate)
     return frame
+
+
+def _sees_only_pixels(name: str, frame: Frame) -> bool:
+    """Whether invalid pixels beside a frame change nothing of an estimate.
+
+    So it is for local functions of what is there; denoisers fill such pixels first.
+    """
+    method, held = METHODS[name], frame.estimates.get(_DENOISER)
+    there = held is not None and held.halves is not None
+    return method.pure and (method.takes == "nothing" or there)
 
 
 def tell(progress: Callable[[str], None] | None, what: str, before: Any) -> None:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jscomb import ensemble, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame
-from jscomb.methods._inputs import given_to, inputs, tell, with_inputs
+from jscomb.methods._inputs import given_to, inputs, tell, with_input, with_inputs
 from jscomb.methods._table import METHODS
-from jscomb.numerics.tiles import compiled
+from jscomb.numerics.tiles import compiled, cut, padded
 from jscomb.typing import Key
 
 _CROP = 256  # pixels along the side of the part whose denoising is timed
@@ -153,8 +153,8 @@ def _within(frame: Frame, tier: str | None, budget: float | None) -> tuple[str, 
 def _seconds(frame: Frame) -> float:
     """Seconds of denoising a frame, from a part of it."""
     height, width = frame.color.shape[:2]
-    part = lambda leaf: leaf[..., :_CROP, :_CROP, :] if leaf.ndim > 2 else leaf
-    small = jax.tree.map(part, frame._replace(estimates={}, reference=None)).merged(1)
+    bare = frame._replace(estimates={}, reference=None)
+    small = cut(bare, _CROP, _CROP).merged(1)
     times = []
     for _ in range(2):
         start = time.perf_counter()
@@ -200,9 +200,11 @@ def _single(
     method, tier = ("denoised", "denoised") if missing else ("multi-scale", "fast")
     if name not in alone.estimates:
         tell(progress, f"making {name}", alone)
-    alone, given = given_to(key, alone, method, name)
+    alone = with_input(key, alone, name)
     tell(progress, f"combining by {method}", alone)
-    image = METHODS[method].image(key, alone, *given)
+    height, width = alone.color.shape[:2]
+    alone, given = given_to(key, padded(alone), method, name)
+    image = cut(METHODS[method].image(key, alone, *given), height, width)
     reason = f"fast needs {missing}" if missing else ""
     return Combined(Estimate(image), tier, (name,), {}, reason, None)
 

@@ -24,8 +24,10 @@ from jscomb.numerics.tiles._plans import network_plan
 from jscomb.numerics.tiles._programs import (
     by_device,
     compiled,
+    cut,
     in_memory,
     in_one_pass,
+    padded,
 )
 
 __all__ = [
@@ -38,6 +40,7 @@ __all__ = [
     "by_device",
     "compiled",
     "crops",
+    "cut",
     "flat",
     "fold_rows",
     "in_memory",
@@ -46,6 +49,7 @@ __all__ = [
     "map_rows",
     "map_shards",
     "network_plan",
+    "padded",
     "stream_crops",
     "sum_over_tiles",
     "tile_side",

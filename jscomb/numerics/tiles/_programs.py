@@ -39,6 +39,59 @@ def _compiled(function: Callable[..., Any], *static: tuple[str, Hashable]) -> Ca
     return jax.jit(functools.partial(function, **dict(static)))
 
 
+def padded(tree: Any, *, multiple: int = 64) -> Any:
+    """Return images with invalid pixels up to a multiple of their size.
+
+    Programs are compiled for one size: so those near each other share them. A function
+    that leaves invalid pixels out of its windows makes of the rest what it made before.
+
+    Args:
+        tree: of arrays; images are those with three axes or more, [...,H,W,C].
+        multiple: of the height and of the width.
+
+    Returns:
+        the tree, its images with NaN below and to the right; to be `cut`.
+
+    Example:
+        >>> print(padded(jnp.ones((1, 3, 1)), multiple=2)[..., 0])
+        [[ 1.  1.  1. nan]
+         [nan nan nan nan]]
+    """
+    return compiled(_pad, multiple=multiple)(tree)
+
+
+def _pad(tree: Any, *, multiple: int) -> Any:
+    """`padded`, as one program."""
+
+    def pad(image: Array) -> Array:
+        if image.ndim < 3:
+            return image
+        below, right = (-size % multiple for size in image.shape[-3:-1])
+        ends = [(0, 0)] * (image.ndim - 3) + [(0, below), (0, right), (0, 0)]
+        return jnp.pad(image, ends, constant_values=jnp.nan)
+
+    return jax.tree.map(pad, tree)
+
+
+def cut(tree: Any, height: int, width: int) -> Any:
+    """Return images without the pixels below and to the right of a size.
+
+    Args:
+        tree: as for `padded`.
+        height: in pixels.
+        width: in pixels.
+
+    Returns:
+        the tree, its images [...,height,width,C].
+
+    Example:
+        >>> print(cut(padded(jnp.ones((1, 3, 1))), 1, 3)[..., 0])
+        [[1. 1. 1.]]
+    """
+    part = lambda i: i if i.ndim < 3 else i[..., :height, :width, :]
+    return jax.tree.map(part, tree)
+
+
 def by_device(*, cpu: int, accelerator: int) -> int:
     """Return how much to compute at a time, on the device that programs run on.
 

@@ -285,13 +285,19 @@ def _feature_pair(p: Pairs, q: Pairs) -> Array:
 
 
 def _square_slope(features: Float[Array, "h w f"], axis: int) -> Float[Array, "h w f"]:
-    """Return the squared central difference along an axis, 0 at invalid pixels."""
+    """Return the squared central difference along an axis.
+
+    Instead of a neighbour that is invalid or beyond the border the pixel itself counts.
+    """
     size = features.shape[axis]
-    at = lambda step: jnp.take(
-        features, np.clip(np.arange(size) + step, 0, size - 1), axis=axis
-    )
-    _, after, before = zero_invalid(at(1), at(-1))
-    return jnp.square((after - before) / 2)
+    valid, clean = zero_invalid(features)
+
+    def at(step: int) -> Array:
+        near = np.clip(np.arange(size) + step, 0, size - 1)
+        there, moved = (jnp.take(i, near, axis=axis) for i in (valid, clean))
+        return jnp.where(there, moved, clean)
+
+    return jnp.square((at(1) - at(-1)) / 2)
 
 
 def _square_distance(p: Pairs, q: Pairs) -> Array:
