@@ -409,3 +409,18 @@ def test_spread_is_a_weighted_variance(rng):
     expected = (w * (y - (w * y).sum(axis=0)) ** 2).sum(axis=0)
     found = ensemble.spread(jnp.asarray(y), jnp.asarray(w))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_blocks_without_pixels_have_weights_and_change_no_others(rng):
+    """Of sum one; as if the frame ended beside them."""
+    x = rng.normal(2, 0.5, (2, 40, 24, 3))
+    x[:, :, 12:] += 2  # where the second base is wrong
+    x = jnp.asarray(x)
+    y = jnp.stack([x + 0.2, jnp.full_like(x, 2.1), x])  # [N,2,H,W,C]
+    y_a, y_b = y[:, 0], y[:, 1]
+    alone = ensemble.solve_weights(*(i[..., :15, :, :] for i in (y_a, y_b, *x)))
+    gone = [i.at[..., 15:, :, :].set(jnp.nan) for i in (y_a, y_b, *x)]
+    found = ensemble.solve_weights(*gone)
+    np.testing.assert_allclose(found[:, :15], alone, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.sum(0), 1, rtol=1e-9)
+    assert alone.std((1, 2)).max() > 1e-3

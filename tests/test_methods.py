@@ -99,6 +99,20 @@ def test_sizes_near_each_other_share_programs(glass_frame):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("tier", ["fast", "balanced"])
+def test_a_tier_is_the_same_beside_invalid_pixels(tier, glass_frame, monkeypatch):
+    frame = cut(glass_frame, 19, 22)
+    biased = "oidn" if tier == "fast" else ["oidn", "path-tracing", "whitened"]
+    made = combine_tier(key(), frame, tier=tier, biased=biased)
+    for module in ("_tiers", "_inputs"):
+        monkeypatch.setattr(f"jscomb.methods.{module}.padded", lambda tree: tree)
+    alone = combine_tier(key(), frame, tier=tier, biased=biased)
+    assert made.tier == alone.tier == tier
+    found, expected = ((m.estimate, m.error) for m in (made, alone))
+    for one, other in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
 @needs_oidn
 @pytest.mark.slow
 def test_an_ensemble_of_combiners_gives_both_halves_the_same_weights(small):

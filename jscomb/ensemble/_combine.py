@@ -1,12 +1,13 @@
 """From errors to weights, and from weights to the image."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jscomb.ensemble._estimate import SCALES, error_matrix, selection_errors
 from jscomb.ensemble._evidence import Bases, check_bases
@@ -14,7 +15,7 @@ from jscomb.ensemble._filter import Filter, Guide, filter_weights
 from jscomb.numerics import simplex
 from jscomb.numerics.guards import first_finite, zero_invalid
 from jscomb.numerics.linear import stack_sum
-from jscomb.numerics.windows import window_mean
+from jscomb.numerics.windows import block_sum, window_mean
 from jscomb.typing import Image, Key, Variance
 
 Blocks = Float[Array, "n rows columns _"]
@@ -191,7 +192,8 @@ def solve_weights(
             shared=shared,
             block=block,
         )
-        weights = interpolated(simplex.quadratic(matrix), block)
+        there = block_sum(zero_invalid(*images)[0].astype(matrix.dtype), block) > 0
+        weights = interpolated(simplex.quadratic(matrix), block, there)
         height, width = biased_a.shape[1:3]
         return jnp.broadcast_to(weights[:, :height, :width], biased_a.shape)
     _, *clean = zero_invalid(*images)
@@ -210,26 +212,48 @@ def solve_weights(
     return simplex.iterative(solver_key, *clean)
 
 
-def interpolated(weights: Blocks, block: int) -> Bases:
-    """Values of every pixel from those of blocks: smooth, without a seam."""
+def interpolated(
+    weights: Blocks, block: int, there: Bool[Array, "rows columns 1"] | None = None
+) -> Bases:
+    """Values of every pixel from those of blocks: smooth, without a seam.
+
+    Blocks that are not there change no value of the others.
+    """
     if block == 1:
         return weights
+    if there is None:
+        there = jnp.ones((*weights.shape[1:3], 1), bool)
     window = 2 * round(2 * _SMOOTH) - 1
-    smooth = jax.vmap(lambda w: window_mean(w, window, sigma=_SMOOTH))(weights)
-    return _upsampled(_upsampled(smooth, block, axis=1), block, axis=2)
+    mean = functools.partial(window_mean, window=window, sigma=_SMOOTH)
+    smooth = jax.vmap(functools.partial(mean, mask=there))(weights)
+    smooth = jnp.where(mean(there.astype(weights.dtype)) > 0, smooth, weights)
+    columns, there = _upsampled(smooth, there, block, axis=1)
+    return _upsampled(columns, there, block, axis=2)[0]
 
 
-def _upsampled(values: Array, factor: int, *, axis: int) -> Array:
-    """Linear interpolation between the middles of blocks, constant beyond the last."""
+def _upsampled(
+    values: Array, there: Array, factor: int, *, axis: int
+) -> tuple[Array, Array]:
+    """Linear interpolation between the middles of blocks, constant beyond the last.
+
+    And which of the new blocks, smaller along the axis, are there.
+    """
     values = jnp.moveaxis(values, axis, 0)
-    before = jnp.concatenate([values[:1], values[:-1]])
-    after = jnp.concatenate([values[1:], values[-1:]])
+    known = jnp.moveaxis(there[None], axis, 0)
     parts = []
-    for offset in (np.arange(factor) + 0.5) / factor - 0.5:
-        other = before if offset < 0 else after
-        parts.append(values + abs(float(offset)) * (other - values))
+    for offset in ((np.arange(factor) + 0.5) / factor - 0.5).tolist():
+        other, beside = (_next(i, after=offset > 0) for i in (values, known))
+        change = jnp.where(beside, other - values, 0.0)
+        parts.append(values + abs(offset) * change)
     fine = jnp.stack(parts, axis=1).reshape(-1, *values.shape[1:])
-    return jnp.moveaxis(fine, 0, axis)
+    return jnp.moveaxis(fine, 0, axis), jnp.repeat(there, factor, axis=axis - 1)
+
+
+def _next(values: Array, *, after: bool) -> Array:
+    """The values after or before each along the first axis; the last's own."""
+    if after:
+        return jnp.concatenate([values[1:], values[-1:]])
+    return jnp.concatenate([values[:1], values[:-1]])
 
 
 def one_hot(errors: Bases) -> Bases:

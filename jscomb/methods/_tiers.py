@@ -172,6 +172,8 @@ def _ensemble(
     """Of estimates by name, with weights that both halves share."""
     frame = with_inputs(key, frame, names, progress=progress)
     tell(progress, f"combining {len(names)} estimates", frame)
+    height, width = frame.color.shape[:2]
+    frame = padded(frame)
     estimates = {name: frame.estimates[name] for name in names}
     weights = ensemble.weigh_frame(frame, estimates)
     bases = ensemble.stack_estimates(estimates)
@@ -180,6 +182,7 @@ def _ensemble(
     made = Estimate(image, jnp.stack(halves))
     spread = compiled(ensemble.spread)(bases.biased, weights)
     error = compiled(metrics.estimate_error)(*made, unbiased, spread)
+    made, error = cut((made, error), height, width)
     return Combined(made, "", tuple(names), {}, "", error)
 
 
