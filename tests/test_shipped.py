@@ -18,7 +18,7 @@ from jscomb.denoisers import oidn
 from jscomb.learning import recipes
 from jscomb.learning.examples import combined
 from jscomb.learning.recipes import RECIPES
-from jscomb.methods import TIERS
+from jscomb.methods import METHODS
 from jscomb.metrics import rel_l2
 
 FRAMES = sorted(pathlib.Path(__file__).parent.glob("data/*.exr"))
@@ -98,8 +98,8 @@ def kept(values, untrained, plain):
     return {promise for promise, holds in held.items() if holds}
 
 
-def test_an_ensembles_network_is_trained_on_what_a_tier_is_made_of():
-    assert set(recipes.BASES) == set(TIERS["balanced"].bases)
+def test_an_ensembles_network_is_trained_on_what_its_method_is_made_of():
+    assert set(recipes.BASES) == set(METHODS["neural-ensemble"].bases)
 
 
 def test_the_frames_are_of_several_scenes_and_counts():

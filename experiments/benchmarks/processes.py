@@ -1,9 +1,10 @@
 """What do several processes gain on a sequence of frames?
 
-A frame is mirrored until it is as large as asked, and written several times. The
-command `jscomb combine` makes all results in one process, then each of several
-processes makes its share, on cores of its own as a scheduler's array job does. A run
-before, which is not counted, compiles what there is to compile.
+A frame is mirrored until it is as large as asked, and its file has several names, so
+that reading takes no disk. The command `jscomb combine` makes all results in one
+process, then each of several processes makes its share, on cores of its own as a
+scheduler's array job does. A run before, which is not counted, compiles what there is
+to compile.
 """
 
 import dataclasses
@@ -129,8 +130,9 @@ def run(config: Config) -> list[Found]:
         folder = pathlib.Path(name)
         frame = exr.read_frame(config.frame)._replace(estimates={}, reference=None)
         frames = [folder / f"{number:03}.exr" for number in range(config.frames)]
-        for path in frames:
-            exr.write_frame(path, mirrored(frame, config.size))
+        exr.write_frame(frames[0], mirrored(frame, config.size))
+        for path in frames[1:]:
+            path.hardlink_to(frames[0])
         found = []
         for count in tqdm(config.processes, unit="way"):
             # Programs are kept by the number of cores that they are compiled for.
