@@ -460,6 +460,18 @@ def test_a_reader_that_stops_early_is_no_error():
     assert done.stderr == ""
 
 
+def test_programs_that_are_kept_are_no_error(tmp_path):
+    """Twice, from a process that has imported JAX, which sets what is logged."""
+    words = [sys.executable, "-m", "jscomb", "info", GLASS]
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "TF_CPP_MIN_LOG_LEVEL": "1"}
+    for _ in range(2):
+        done = subprocess.run(
+            words, capture_output=True, text=True, check=True, env=os.environ | kept
+        )
+        assert done.stderr == ""
+    assert [*tmp_path.iterdir()]
+
+
 def test_from_the_shell(tmp_path):
     """As a process: exit status, streams, no traceback."""
     done = subprocess.run(

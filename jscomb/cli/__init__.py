@@ -81,7 +81,9 @@ def _use_compilation_cache() -> None:
     JAX reads this when it is imported, in other processes too.
     """
     # JAX 0.10.1 complains about every program that it finds there, of a processor that
-    # lacks a preference of the compiler; all run.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # lacks a preference of the compiler; all run. A process that has imported JAX hands
+    # on JAX's own level, 1, to those that it starts.
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache.folder() / "xla"))
