@@ -96,6 +96,7 @@ def test_derivative_is_the_true_one(rng, scale):
     assert (moved == 0).all()
 
 
+@pytest.mark.slow
 def test_sure_is_unbiased():
     """Of a curved denoiser, over many frames, by its standard errors."""
     box = denoisers.black_box(lambda color: blur(color) ** 2 / 1.2)

@@ -120,6 +120,7 @@ def test_double_shrinkage_of_an_ensemble(frame):
     assert given.halves is None
 
 
+@pytest.mark.slow
 @needs_oidn
 def test_real_denoisers_and_networks_compose(glass_frame):
     """James-Stein on an ensemble of Open Image Denoise, PD and a blur, then DSC."""

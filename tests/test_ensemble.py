@@ -1,5 +1,7 @@
 """Ensemble denoising: its matrix, weights, filter and promises."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -358,8 +360,11 @@ def test_blocks_and_weights_of_pixels_are_those_of_loops(rng):
 def test_weights_of_blocks_are_smooth(truth):
     """No seam between blocks, and near those of every pixel."""
     images = rendering(jax.random.key(5), truth, 0.3)[1:]
-    solve = lambda block: ensemble.solve_weights(
-        *images, solver="multi-scale", windows=(13,), block=block
+    solve = jax.jit(
+        lambda block: ensemble.solve_weights(
+            *images, solver="multi-scale", windows=(13,), block=block
+        ),
+        static_argnums=0,
     )
     fine, coarse = solve(1), solve(4)
     np.testing.assert_allclose(coarse.sum(axis=0), 1.0, rtol=1e-9)
@@ -388,13 +393,9 @@ def test_fireflies_do_not_buy_weights(where):
             x = x.at[1, row, column].set(60.0)
             v = v.at[1, row, column].set(900.0)
     y = jnp.stack([good, through])
-    weights = ensemble.solve_weights(
-        *(y[:, 0], y[:, 1], *x),
-        solver="multi-scale",
-        variance_a=v[0],
-        variance_b=v[1],
-        windows=(29,),
-    )
+    solve = functools.partial(ensemble.solve_weights, windows=(29,))
+    images = y[:, 0], y[:, 1], *x
+    weights = jax.jit(solve)(*images, variance_a=v[0], variance_b=v[1])
     near = jnp.stack([weights[:, row, column, 0] for row, column in spots])
     # Both are equally wrong where there is no firefly: 0.02 squared.
     if where == "a base":
@@ -418,9 +419,9 @@ def test_blocks_without_pixels_have_weights_and_change_no_others(rng):
     x = jnp.asarray(x)
     y = jnp.stack([x + 0.2, jnp.full_like(x, 2.1), x])  # [N,2,H,W,C]
     y_a, y_b = y[:, 0], y[:, 1]
-    alone = ensemble.solve_weights(*(i[..., :15, :, :] for i in (y_a, y_b, *x)))
-    gone = [i.at[..., 15:, :, :].set(jnp.nan) for i in (y_a, y_b, *x)]
-    found = ensemble.solve_weights(*gone)
+    solve = jax.jit(ensemble.solve_weights)
+    alone = solve(*(i[..., :15, :, :] for i in (y_a, y_b, *x)))
+    found = solve(*(i.at[..., 15:, :, :].set(jnp.nan) for i in (y_a, y_b, *x)))
     np.testing.assert_allclose(found[:, :15], alone, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.sum(0), 1, rtol=1e-9)
     assert alone.std((1, 2)).max() > 1e-3

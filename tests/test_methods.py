@@ -130,7 +130,7 @@ def test_an_ensemble_of_combiners_gives_both_halves_the_same_weights(small):
 
 
 @needs_oidn
-@pytest.mark.parametrize("name", ALONE)
+@pytest.mark.parametrize("name", slow_ones(ALONE))
 def test_the_unit_of_the_frame_does_not_matter(name, small):
     frame = small.merged(2)
     made = METHODS[name].needs.missing(frame.normalised())

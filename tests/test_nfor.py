@@ -119,6 +119,7 @@ def test_rdfc_of_a_frame():
         assert error(base) < 0.3 * error(half.color)
 
 
+@pytest.mark.slow
 def test_rdfc_selects_by_risk(rng):
     """By the parts, step after step; one candidate is itself."""
     x, v = jnp.asarray(rng.normal(1, 0.3, (20, 18, 3))), jnp.full((20, 18, 3), 0.09)
@@ -155,6 +156,7 @@ def test_rdfc_by_features_alone_does_not_compare_colours():
     np.testing.assert_allclose(run(f[..., :0]).ravel(), 15 / 4)
 
 
+@pytest.mark.slow
 def test_rdfc_selection_beats_its_candidates(rng):
     """Where one half has texture that no feature shows, the other only features."""
     y, z = np.mgrid[:48, :48]

@@ -212,6 +212,7 @@ def test_each_network_is_one_model():
     assert sorted(numbers) == list(range(len(_weights.trained_networks())))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs", [3, 9])
 @pytest.mark.parametrize("size", ["small", "large"])
 def test_reach_is_exact(inputs, size):
@@ -237,6 +238,7 @@ def small_network():
     return jax.tree.map(lambda a: a.astype(jnp.float64), network)
 
 
+@pytest.mark.slow
 def test_by_crops_it_is_the_whole(small_network, monkeypatch):
     model = Model()
     x = jax.random.exponential(jax.random.key(1), (300, 230, 3), jnp.float64)

@@ -112,7 +112,13 @@ def test_the_frames_are_of_several_scenes_and_counts():
     assert not {scene.removeprefix("unseen-") for scene in scenes} & trained
 
 
-@pytest.mark.parametrize("name", KEPT)
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n != "neural-ensemble" else pytest.param(n, marks=pytest.mark.slow)
+        for n in KEPT
+    ],
+)
 def test_a_shipped_network_keeps_its_promises(name):
     untrained = [of_network(name, seed) for seed in SEEDS]
     found, plain = of_network(name), without(name)

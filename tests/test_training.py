@@ -33,6 +33,7 @@ def train(frames, out, run=RUN):
     return cli.train_files(run, RECIPES[run.method], frames, out)
 
 
+@pytest.mark.slow
 def test_the_best_step_is_kept(frames, tmp_path):
     """And is what the card says: settings, data, and the error on other scenes."""
     card = train(frames, tmp_path)

@@ -171,6 +171,7 @@ def test_gamma_is_the_brute_force_choice(guides, count):
         np.testing.assert_allclose(chosen[row, column], 0.01 * multiples[best])
 
 
+@pytest.mark.slow
 def test_frames_with_every_option():
     """By the functions of arrays, on normalised sub-averages."""
     y, z = estimates((9, 8), sub_averages=8, channels=3)

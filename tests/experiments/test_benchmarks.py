@@ -144,6 +144,7 @@ def test_robustness_counts_what_is_bad():
     assert "| foreign |  |  |  | 1 |" in said.body
 
 
+@pytest.mark.slow
 def test_files_are_read_and_written_beside_openexr():
     found = files.run(files.Config(quick=True))
     assert found.keys() == files.WAYS.keys()

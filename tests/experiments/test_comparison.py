@@ -86,6 +86,7 @@ def test_sweep_goes_on_after_a_line_cut_short(archive):
     assert sweep.results(archive.results) == again
 
 
+@pytest.mark.slow
 def test_quick_form_renders_seeds(vectorised, tmp_path):
     path = tmp_path / "r.jsonl"
     config = page.Config(path, out=tmp_path / "p.html", combiners=FEW, quick=True)
@@ -192,6 +193,7 @@ def test_stability_of_what_has_no_network():
     assert f"finite in {len(found)} of {len(found)} trials" in said.answer
 
 
+@pytest.mark.slow
 def test_tiers_are_measured(glass_frame, tmp_path):
     exr.write_frame(tmp_path / "cornell-glass-64.exr", glass_frame)
     config = tiers.Config(tmp_path, tmp_path / "results.jsonl", quick=True)

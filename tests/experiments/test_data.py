@@ -71,6 +71,7 @@ def test_a_seed_is_a_scene(vectorised):
     assert np.abs(first - other).max() > 0.1
 
 
+@pytest.mark.slow
 def test_scenes_are_lit_and_differ(vectorised):
     """Ten seeds: light everywhere but where the camera sees past the walls."""
     pictures = [rendered(vectorised, seed) for seed in range(10)]
@@ -150,6 +151,7 @@ ROOM = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.slow
 def test_variations_of_a_scene(vectorised, tmp_path):
     """A seed is one variation; cameras, lights and materials differ; all see light."""
     original = tmp_path / "scene.xml"

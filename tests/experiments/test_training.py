@@ -67,6 +67,7 @@ def test_a_network_like_its_untrained_self_keeps_no_promise():
     assert not learned.verdict(found, "pd")["5 % below the form without a network"]
 
 
+@pytest.mark.slow
 def test_the_cost_of_networks_is_their_convolutions():
     costs = cost.run(cost.Config(quick=True))
     assert all(each.seconds > 0 for each in costs.values())

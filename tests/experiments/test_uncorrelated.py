@@ -36,6 +36,7 @@ def box(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_uncorrelated_kernels_are_measured(box, vectorised):
     """A scene file is rendered with both kinds of numbers, every method measured."""
     config = error.Config(box, box, box / "out", quick=True)
@@ -64,6 +65,7 @@ def test_uncorrelated_kernels_are_measured(box, vectorised):
         error.run(error.Config(box, box / "out", box))
 
 
+@pytest.mark.slow
 def test_windows_are_measured_on_two_films(box, vectorised):
     found = windows.run(windows.Config(box, box, box / "out", quick=True))
     assert found["speed"].keys() == {"5", "7"}
