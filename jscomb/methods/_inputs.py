@@ -12,6 +12,7 @@ from jscomb.methods._table import METHODS
 from jscomb.numerics.tiles import cut, padded
 from jscomb.typing import Key
 
+_LARGE = 2**21  # pixels
 _DENOISER = "oidn"  # for frames without an estimate
 
 
@@ -222,13 +223,21 @@ def with_inputs(
             continue
         tell(progress, f"making {name}", frame)
         frame = with_input(key, frame, name)
-    wide = padded(frame) if local else frame
+    wide = of_shared_size(frame) if local else frame
     for name in local:
         tell(progress, f"making {name}", wide)
         wide = with_input(key, wide, name)
         estimate = cut(wide.estimates[name], *frame.color.shape[:2])
         frame = frame.with_estimate(name, estimate)
     return frame
+
+
+def of_shared_size(frame: Frame) -> Frame:
+    """The frame with invalid pixels beside it, so that sizes near it share programs.
+
+    A large one as it is: it takes longer than its compilation, and a copy of it room.
+    """
+    return padded(frame) if frame.color[..., 0].size <= _LARGE else frame
 
 
 def _sees_only_pixels(name: str, frame: Frame) -> bool:

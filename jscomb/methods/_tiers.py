@@ -10,9 +10,16 @@ import jax.numpy as jnp
 from jscomb import ensemble, metrics
 from jscomb.denoisers import oidn
 from jscomb.frame import Estimate, Frame
-from jscomb.methods._inputs import given_to, inputs, tell, with_input, with_inputs
+from jscomb.methods._inputs import (
+    given_to,
+    inputs,
+    of_shared_size,
+    tell,
+    with_input,
+    with_inputs,
+)
 from jscomb.methods._table import METHODS
-from jscomb.numerics.tiles import compiled, cut, padded
+from jscomb.numerics.tiles import compiled, cut
 from jscomb.typing import Key
 
 _CROP = 256  # pixels along the side of the part whose denoising is timed
@@ -173,7 +180,7 @@ def _ensemble(
     frame = with_inputs(key, frame, names, progress=progress)
     tell(progress, f"combining {len(names)} estimates", frame)
     height, width = frame.color.shape[:2]
-    frame = padded(frame)
+    frame = of_shared_size(frame)
     estimates = {name: frame.estimates[name] for name in names}
     weights = ensemble.weigh_frame(frame, estimates)
     bases = ensemble.stack_estimates(estimates)
@@ -206,7 +213,7 @@ def _single(
     alone = with_input(key, alone, name)
     tell(progress, f"combining by {method}", alone)
     height, width = alone.color.shape[:2]
-    alone, given = given_to(key, padded(alone), method, name)
+    alone, given = given_to(key, of_shared_size(alone), method, name)
     image = cut(METHODS[method].image(key, alone, *given), height, width)
     reason = f"fast needs {missing}" if missing else ""
     return Combined(Estimate(image), tier, (name,), {}, reason, None)
