@@ -203,6 +203,7 @@ PURE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PURE)
 def test_compositions_jit_vmap_and_differentiate(name, frame):
     compose = PURE[name]

@@ -463,6 +463,7 @@ class Wide(Pooling):
     reach = 9
 
 
+@pytest.mark.slow
 def test_a_frame_by_a_network(glass_frame):
     """The same as by arrays; halves are the halves combined."""
     frame, network = glass_frame.normalised(), Pooling(jnp.float32(2.0))

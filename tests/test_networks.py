@@ -244,6 +244,7 @@ def test_an_ensembles_order_does_not_matter(rng):
     )
 
 
+@pytest.mark.slow
 def test_an_unknown_base_is_as_if_it_were_not_there(rng):
     network = waking(networks.EnsembleNetwork(key(), size="light"))
     inputs = bases_of(rng, 2)

@@ -59,6 +59,7 @@ def test_the_best_step_is_kept(frames, tmp_path):
     np.testing.assert_allclose(min(errors), float(error / better), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_one_without_interruption(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(_training, "_SAVE_EVERY", 0.0)
     whole = train(frames, tmp_path / "whole")
@@ -131,6 +132,7 @@ def test_without_references_half_of_the_samples_are_the_target(
     assert (tmp_path / "run" / "network.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_validation_is_the_error_over_the_better_input(frames, tmp_path):
     """The inputs themselves have ratios of at least one, the better one of one."""
     held = sorted(frames.glob("*.exr"))

@@ -11,6 +11,7 @@ from tests.battery.rendering import rendering_of
 ENTRIES = catalogue.combiners() | catalogue.denoisers() | catalogue.solvers()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -154,6 +154,7 @@ def test_power_laws_are_found():
     assert factors["oidn"] == (pytest.approx(1), False)
 
 
+@pytest.mark.slow
 def test_a_severely_biased_image_is_kept_out(archive):
     """A 15x15 blur, beside fireflies: the combination is better than it at least."""
     records = sweep.run(
@@ -246,6 +247,7 @@ def test_members_join_as_long_as_they_pay():
     assert members.cost_of(("whitened",), costs) == pytest.approx(3.1)
 
 
+@pytest.mark.slow
 def test_members_are_judged_without_their_scene(glass_frame, tmp_path):
     for scene in ("a", "b"):
         exr.write_frame(tmp_path / f"{scene}-64.exr", glass_frame)
