@@ -413,7 +413,7 @@ def test_spread_is_a_weighted_variance(rng):
 
 
 def test_blocks_without_pixels_have_weights_and_change_no_others(rng):
-    """Of sum one; as if the frame ended beside them."""
+    """Of sum one; as if the frame ended beside them. Derivatives stay finite."""
     x = rng.normal(2, 0.5, (2, 40, 24, 3))
     x[:, :, 12:] += 2  # where the second base is wrong
     x = jnp.asarray(x)
@@ -421,7 +421,11 @@ def test_blocks_without_pixels_have_weights_and_change_no_others(rng):
     y_a, y_b = y[:, 0], y[:, 1]
     solve = jax.jit(ensemble.solve_weights)
     alone = solve(*(i[..., :15, :, :] for i in (y_a, y_b, *x)))
-    found = solve(*(i.at[..., 15:, :, :].set(jnp.nan) for i in (y_a, y_b, *x)))
+    gone = [i.at[..., 15:, :, :].set(jnp.nan) for i in (y_a, y_b, *x)]
+    found = solve(*gone)
+    slope = jax.jit(jax.grad(lambda y, *i: jnp.sum(jnp.square(solve(y, *i)))))(*gone)
+    assert np.isfinite(slope).all()
+    assert jnp.abs(slope[..., :15, :, :]).max() > 0
     np.testing.assert_allclose(found[:, :15], alone, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.sum(0), 1, rtol=1e-9)
     assert alone.std((1, 2)).max() > 1e-3

@@ -40,7 +40,8 @@ class Tier(NamedTuple):
     denoisings: float
 
 
-# A narrow search costs an ensemble nearly nothing (experiments.ensemble.searching).
+# A narrow search takes a third of the time; what it costs an ensemble in error is
+# measured by experiments.ensemble.searching.
 _FEW = (
     *("oidn", "path-tracing", "oidn-demodulated", "nonlocal-means-narrow"),
     *("whitened", "multi-scale"),

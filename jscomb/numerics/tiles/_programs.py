@@ -40,13 +40,14 @@ def _compiled(function: Callable[..., Any], *static: tuple[str, Hashable]) -> Ca
 
 
 def padded(tree: Any, *, multiple: int = 64) -> Any:
-    """Return images with invalid pixels up to a multiple of their size.
+    """Return images with invalid pixels up to a multiple in height and width.
 
     Programs are compiled for one size: so those near each other share them. A function
     that leaves invalid pixels out of its windows makes of the rest what it made before.
 
     Args:
-        tree: of arrays; images are those with three axes or more, [...,H,W,C].
+        tree: of arrays; images are those with three axes or more, [...,H,W,C], of any
+            unit.
         multiple: of the height and of the width.
 
     Returns:
